@@ -1,0 +1,252 @@
+"""The command line: options become typed arguments, errors become one line and an exit code."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import sys
+import traceback
+from pathlib import Path
+from typing import Annotated, Literal, cast
+
+import typer
+
+from gsdmsr_cli import __version__
+from gsdmsr_cli.errors import GsdmsrError, UsageError
+
+# Commands are imported in the function that runs them: torch alone would make --help slow.
+
+app = typer.Typer(
+    help="Dynamic 3D Gaussian splatting: train, render, measure and export.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+benchmark_app = typer.Typer(help="Measure speed.", no_args_is_help=True)
+app.add_typer(benchmark_app, name="benchmark")
+
+RunFolder = Annotated[Path, typer.Argument(metavar="RUN", help="Folder that train wrote.")]
+Json = Annotated[bool, typer.Option("--json", help="Print one JSON object and nothing else.")]
+Background = Literal["white", "black"]
+
+# What the machine, not the program, is to blame for when a file cannot be read or written.
+_MACHINE_ERRNOS = frozenset(
+    {
+        errno.ENOSPC,
+        errno.EDQUOT,
+        errno.EFBIG,
+        errno.EROFS,
+        errno.EACCES,
+        errno.EPERM,
+        errno.EIO,
+        errno.EMFILE,
+        errno.ENAMETOOLONG,
+        errno.ENOTDIR,
+        errno.EISDIR,
+    }
+)
+
+
+def _version(value: bool) -> None:
+    if value:
+        typer.echo(f"gsdmsr {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _common(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")
+    ] = False,
+) -> None:
+    pass
+
+
+@app.command()
+def train(
+    data: Annotated[Path, typer.Option(metavar="DIR", help="Scene folder, such as a D-NeRF one.")],
+    out: Annotated[Path, typer.Option(metavar="RUN", help="Run folder to write.")],
+    preset: Annotated[str | None, typer.Option(help="Preset to start from.")] = None,
+    config: Annotated[
+        Path | None, typer.Option(metavar="F.yaml", help="File of options over the preset.")
+    ] = None,
+    set_: Annotated[
+        list[str] | None, typer.Option("--set", metavar="a.b=v", help="One option; repeatable.")
+    ] = None,
+    budget: Annotated[str | None, typer.Option(help="Wall time of training, such as 8m.")] = None,
+    steps: Annotated[int | None, typer.Option(help="Number of steps instead of a budget.")] = None,
+    downscale: Annotated[int | None, typer.Option(help="Divide both sides of pictures.")] = None,
+    background: Annotated[
+        Background | None, typer.Option(help="Colour behind transparent pixels.")
+    ] = None,
+    seed: Annotated[int | None, typer.Option(help="Seed of every random choice.")] = None,
+    device: Annotated[
+        Literal["auto", "cpu", "cuda"], typer.Option(help="Where to compute.")
+    ] = "auto",
+    threads: Annotated[int | None, typer.Option(help="CPU threads; 0 takes all cores.")] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Continue RUN.")] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace RUN.")] = False,
+) -> None:
+    """Reconstruct a moving scene from its pictures."""
+    if budget is not None and steps is not None:
+        raise UsageError("--budget and --steps are both given; drop one")
+    if resume and overwrite:
+        raise UsageError("--resume and --overwrite are both given; drop one")
+    from gsdmsr_cli.commands import train as command
+
+    options = {
+        "training.budget": budget,
+        "training.steps": steps,
+        "data.downscale": downscale,
+        "data.background": background,
+        "training.seed": seed,
+        "training.threads": threads,
+    }
+    overrides = [*(set_ or []), *_overrides(options)]
+    command.run(data, out, preset, config, overrides, device, resume, overwrite)
+
+
+def _overrides(options: dict[str, str | int | None]) -> list[str]:
+    """Return ``--set`` texts of the options that are given; steps put an end to a budget."""
+    given = {key: value for key, value in options.items() if value is not None}
+    no_budget = ["training.budget=null"] if "training.steps" in given else []
+    return no_budget + [f"{key}={json.dumps(value)}" for key, value in given.items()]
+
+
+@app.command("eval")
+def evaluate(
+    run_folder: RunFolder,
+    split: Annotated[Literal["test", "val"], typer.Option(help="Views to compare.")] = "test",
+    background: Annotated[
+        Background | None, typer.Option(help="Instead of the one trained with.")
+    ] = None,
+    downscale: Annotated[
+        int | None, typer.Option(min=1, help="Instead of the one trained with.")
+    ] = None,
+    lpips_weights: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Folder of LPIPS weights.")
+    ] = None,
+    as_json: Json = False,
+    fail_under: Annotated[
+        list[str] | None,
+        typer.Option(metavar="METRIC=VALUE", help="Exit with 4 below it; repeatable."),
+    ] = None,
+) -> None:
+    """Measure a run on views it has not seen."""
+    from gsdmsr_cli.commands import eval as command
+
+    command.run(run_folder, split, background, downscale, lpips_weights, as_json, fail_under or [])
+
+
+@app.command()
+def render(
+    run_folder: RunFolder,
+    path: Annotated[
+        Literal["test", "orbit"] | None, typer.Option(help="Cameras; both if not given.")
+    ] = None,
+    frames: Annotated[int | None, typer.Option(min=1, help="Frames of the orbit.")] = None,
+    out: Annotated[Path | None, typer.Option(metavar="DIR", help="Folder to write.")] = None,
+) -> None:
+    """Draw a run to pictures and a video."""
+    from gsdmsr_cli.commands import render as command
+
+    command.run(run_folder, path, frames, out)
+
+
+@app.command()
+def export(
+    run_folder: RunFolder,
+    format_: Annotated[
+        Literal["ply", "ply-sequence"], typer.Option("--format", help="Kind of file.")
+    ],
+    out: Annotated[Path, typer.Option(metavar="PATH", help="File or folder to write.")],
+    time: Annotated[
+        float | None, typer.Option(min=0.0, max=1.0, help="Moment of a ply, 0 to 1.")
+    ] = None,
+    frames: Annotated[
+        int | None, typer.Option(min=1, help="Number of files of a sequence.")
+    ] = None,
+) -> None:
+    """Write a run's splats for other programs."""
+    from gsdmsr_cli.commands import export as command
+
+    command.run(run_folder, format_, time, frames, out)
+
+
+@app.command()
+def demo(
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder to write.")] = Path(
+        "gsdmsr-demo"
+    ),
+) -> None:
+    """Make a small moving scene, reconstruct it and show where to look."""
+    from gsdmsr_cli.commands import demo as command
+
+    command.run(out)
+
+
+@app.command()
+def doctor(as_json: Json = False) -> None:
+    """Report what this machine offers and what is missing."""
+    from gsdmsr_cli.commands import doctor as command
+
+    command.run(as_json)
+
+
+@benchmark_app.command()
+def kernels(
+    yardstick: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Folder of other kernels to compare with.")
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Time every kernel, forward and backward."""
+    from gsdmsr_cli.commands import benchmark as command
+
+    command.run(yardstick, as_json)
+
+
+# The command-line errors of typer share this base, which typer does not export by name.
+_CommandLineError = cast(type[typer.BadParameter], typer.BadParameter.__base__)
+
+
+def main() -> None:
+    """Run the command line and exit: 0 ok, 1 internal, 2 usage, 3 data, 4 threshold, 130 Ctrl-C."""
+    sys.exit(_run())
+
+
+def _run() -> int:
+    try:
+        result = typer.main.get_command(app).main(prog_name="gsdmsr", standalone_mode=False)
+    except (KeyboardInterrupt, typer.Abort):
+        return 130
+    except BrokenPipeError:
+        # the reader of our output has left, as in `gsdmsr doctor | head -1`; keep Python's own
+        # flush at exit from failing on the same pipe
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+    except Exception as error:
+        if os.environ.get("GSDMSR_DEBUG"):
+            traceback.print_exc()
+        message, code = _explain(error)
+        typer.echo(f"error: {' '.join(message.split())}", err=True)
+        return code
+    return result if isinstance(result, int) else 0
+
+
+def _explain(error: Exception) -> tuple[str, int]:
+    """Return the one-line message and the exit code of an error."""
+    if isinstance(error, GsdmsrError):
+        return str(error), error.exit_code
+    if isinstance(error, _CommandLineError):
+        return error.format_message() or "missing command; see --help", UsageError.exit_code
+    if isinstance(error, OSError) and error.errno in _MACHINE_ERRNOS:
+        where = f"{error.filename}: " if error.filename else ""
+        return f"{where}{error.strerror}", 3
+    hint = "set GSDMSR_DEBUG=1 for the traceback"
+    return f"internal: {type(error).__name__}: {error} ({hint})", 1
+
+
+if __name__ == "__main__":
+    main()

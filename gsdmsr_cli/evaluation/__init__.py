@@ -1,0 +1,1 @@
+"""Scores, speed and storage of a trained run."""

@@ -1,0 +1,187 @@
+"""LPIPS (Zhang et al. 2018) in plain torch, from weights that already lie on this machine."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor, nn
+
+from gsdmsr_cli.errors import DataError, UsageError, nearest
+from gsdmsr_cli.evaluation.lpips_trunks import ARCHITECTURES
+
+NETS = tuple(ARCHITECTURES)
+"""Names of the networks: "alex", "squeeze", "vgg"."""
+
+FOLDER_VARIABLE = "GSDMSR_LPIPS_DIR"
+"""Environment variable that names a folder of weights."""
+
+# Mean and standard deviation of ImageNet's colours for pictures in [-1, 1].
+_SHIFT = (-0.030, -0.088, -0.188)
+_SCALE = (0.458, 0.448, 0.450)
+_EPSILON = 1e-10
+
+
+@dataclass(frozen=True)
+class Missing:
+    """Why there is no LPIPS value.
+
+    Attributes:
+        reason: one line naming the files that were looked for.
+        searched: the folders looked into, in order.
+    """
+
+    reason: str
+    searched: tuple[str, ...]
+
+
+class Lpips:
+    """The learned perceptual distance between two pictures; 0 for identical ones."""
+
+    def __init__(self, net: str, trunk: nn.Sequential, weights: list[Tensor]) -> None:
+        """Hold the trunk of ``net`` and one weight vector (C,) per tap."""
+        architecture = ARCHITECTURES[net]
+        self.net = net
+        self.smallest = architecture.smallest
+        self._trunk = trunk.eval()
+        self._weights = dict(zip(architecture.taps, weights, strict=True))
+        self._shift = weights[0].new_tensor(_SHIFT).view(1, 3, 1, 1)
+        self._scale = weights[0].new_tensor(_SCALE).view(1, 3, 1, 1)
+
+    def __call__(self, rendered: Tensor, target: Tensor) -> float:
+        """Return the distance between two (H, W, 3) pictures in [0, 1], mapped to [-1, 1].
+
+        Raises:
+            DataError: the pictures are smaller than ``smallest`` on a side.
+            ValueError: the shapes differ or are not (H, W, 3).
+        """
+        pair = [image.permute(2, 0, 1)[None] * 2.0 - 1.0 for image in (rendered, target)]
+        return float(self.distance(*pair))
+
+    @torch.inference_mode()
+    def distance(self, first: Tensor, second: Tensor) -> Tensor:
+        """Return the distances (B,) between two batches (B, 3, H, W) of pictures in [-1, 1].
+
+        The pictures go through unscaled: feeding [0, 1] gives the variant of many 3DGS tables.
+        Per tap, both features are divided by their norm over the channels, and the squared
+        differences are weighted, summed over the channels and averaged over the picture.
+
+        Raises:
+            DataError: the pictures are smaller than ``smallest`` on a side.
+            ValueError: the shapes differ or are not (B, 3, H, W).
+        """
+        self._check_shapes(first, second)
+        features = torch.cat([first, second]).to(self._shift)
+        features = (features - self._shift) / self._scale
+        total = features.new_zeros(len(first))
+        for index, layer in enumerate(self._trunk):
+            features = layer(features)
+            if index in self._weights:
+                unit = features / (features.norm(dim=1, keepdim=True) + _EPSILON)
+                squares = (unit[: len(first)] - unit[len(first) :]).square()
+                total += squares.mean(dim=(2, 3)) @ self._weights[index]
+        return total
+
+    def _check_shapes(self, first: Tensor, second: Tensor) -> None:
+        """Raise unless both are (B, 3, H, W) of one size, large enough for the trunk."""
+        if first.ndim != 4 or first.shape[1] != 3 or first.shape != second.shape:
+            raise ValueError(
+                f"batches have shapes {tuple(first.shape)} and {tuple(second.shape)}, "
+                "not both the same (B, 3, H, W)"
+            )
+        height, width = first.shape[2:]
+        if min(height, width) < self.smallest:
+            raise DataError(
+                f"pictures of {width} x {height} px are too small for LPIPS with '{self.net}'; "
+                f"it needs at least {self.smallest} px a side: lower --downscale"
+            )
+
+
+def load_lpips(net: str, folder: Path | None = None, device: str = "cpu") -> Lpips | Missing:
+    """Load LPIPS on ``net`` ("alex", "squeeze" or "vgg"); nothing is ever downloaded.
+
+    The two files, trunk and linear layers, are looked for separately in ``folder``, in the folder
+    named by $GSDMSR_LPIPS_DIR, then in torch.hub's checkpoints. The trunk may be named
+    ``<net>.backbone.pth`` or as torchvision names it, and may hold the whole network or its
+    ``features`` alone; the linear layers may be named ``linear/<net>.pth``, ``<net>.pth`` or
+    ``lpips_<net>.pth``.
+
+    Raises:
+        UsageError: there is no such network.
+        DataError: ``folder`` is not a folder, or a weights file is not what its name says.
+    """
+    if net not in ARCHITECTURES:
+        raise UsageError(f"unknown LPIPS network '{net}'; {nearest(net, NETS)}")
+    architecture = ARCHITECTURES[net]
+    folders = _folders(folder)
+    trunk_names = (f"{net}.backbone.pth", architecture.checkpoint)
+    linear_names = (f"linear/{net}.pth", f"{net}.pth", f"lpips_{net}.pth")
+    trunk_file, linear_file = _find(folders, trunk_names), _find(folders, linear_names)
+    if trunk_file is None or linear_file is None:
+        what, names = ("trunk", trunk_names) if trunk_file is None else ("linear", linear_names)
+        reason = f"no {what} weights of LPIPS '{net}': found none of {', '.join(names)}"
+        return Missing(reason, tuple(str(path) for path in folders))
+    weights = _load_linear(linear_file, architecture.channels)
+    trunk = _load_trunk(trunk_file, net).to(device)
+    return Lpips(net, trunk, [weight.to(device) for weight in weights])
+
+
+def _folders(folder: Path | None) -> list[Path]:
+    """Return the folders to search, in order."""
+    if folder is not None and not folder.is_dir():
+        raise DataError(f"{folder} is not a folder; --lpips-weights names a folder of weights")
+    named = os.environ.get(FOLDER_VARIABLE)
+    folders = [folder, Path(named) if named else None, Path(torch.hub.get_dir()) / "checkpoints"]
+    return [path for path in folders if path is not None]
+
+
+def _find(folders: list[Path], names: tuple[str, ...]) -> Path | None:
+    """Return the first of the named files that exists, folder by folder."""
+    paths = (folder / name for folder in folders for name in names)
+    return next((path for path in paths if path.is_file()), None)
+
+
+def _load_trunk(path: Path, net: str) -> nn.Sequential:
+    """Load the trunk from a file of the network's ``features``, with or without that prefix."""
+    # On "meta" nothing is initialised at random: the global generator stays as it was.
+    with torch.device("meta"):
+        trunk = ARCHITECTURES[net].build()
+    expected = {key: tuple(value.shape) for key, value in trunk.state_dict().items()}
+    found = {key.removeprefix("features."): value for key, value in _read(path).items()}
+    trunk.load_state_dict(_pick(path, found, expected), assign=True)
+    return trunk.requires_grad_(False)
+
+
+def _load_linear(path: Path, channels: tuple[int, ...]) -> list[Tensor]:
+    """Load one weight vector (C,) per tap."""
+    expected = {f"lin{i}.model.1.weight": (1, count, 1, 1) for i, count in enumerate(channels)}
+    return [weight.flatten() for weight in _pick(path, _read(path), expected).values()]
+
+
+def _read(path: Path) -> dict[str, Tensor]:
+    """Read a file of named tensors."""
+    try:
+        state = torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:  # the unpickler raises whatever the bytes in the file provoke
+        summary = str(error).partition("\n")[0] or type(error).__name__
+        raise DataError(f"{path} is not a readable weights file: {summary}") from error
+    if not isinstance(state, Mapping) or not all(isinstance(v, Tensor) for v in state.values()):
+        raise DataError(f"{path} does not hold named tensors; fetch the weights again")
+    return {str(key): value for key, value in state.items()}
+
+
+def _pick(
+    path: Path, found: Mapping[str, Tensor], expected: Mapping[str, tuple[int, ...]]
+) -> dict[str, Tensor]:
+    """Return the expected tensors as float32, each checked for its shape and finite values."""
+    for key, shape in expected.items():
+        if key not in found:
+            raise DataError(f"{path} lacks '{key}'; it holds the weights of something else")
+        if tuple(found[key].shape) != shape:
+            raise DataError(f"{path}: '{key}' has shape {tuple(found[key].shape)}, not {shape}")
+        if not found[key].isfinite().all():
+            raise DataError(f"{path}: '{key}' holds NaN or infinite values; fetch it again")
+    return {key: found[key].float() for key in expected}

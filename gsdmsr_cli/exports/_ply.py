@@ -1,0 +1,174 @@
+"""The PLY layout of 3DGS (Kerbl et al. 2023), read and written."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from gsdmsr_cli.errors import DataError
+from gsdmsr_cli.splats import Splats
+
+Array = NDArray[np.float32]
+
+_MEANS = ("x", "y", "z")
+_NORMALS = ("nx", "ny", "nz")
+_DC = ("f_dc_0", "f_dc_1", "f_dc_2")
+_OPACITY = ("opacity",)
+_SCALES = ("scale_0", "scale_1", "scale_2")
+_QUATS = ("rot_0", "rot_1", "rot_2", "rot_3")
+_REST_COUNTS = (0, 9, 24, 45)  # spherical harmonics of degree 0 to 3, without the constant
+
+_TYPES = {
+    "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1",
+    "short": "<i2", "int16": "<i2", "ushort": "<u2", "uint16": "<u2",
+    "int": "<i4", "int32": "<i4", "uint": "<u4", "uint32": "<u4",
+    "float": "<f4", "float32": "<f4", "double": "<f8", "float64": "<f8",
+}  # fmt: skip
+
+
+def write_ply(path: Path, splats: Splats) -> None:
+    """Write splats as the standard 3DGS PLY, little-endian float32.
+
+    Columns: x y z, nx ny nz (zeros), f_dc_*, f_rest_* (all red, all green, all blue; none at
+    degree 0), opacity (logit), scale_* (natural logarithm), rot_* (wxyz, unit length). Axes are
+    the scene's, as COLMAP's. The file appears whole or not at all; its folder is made.
+
+    Raises:
+        DataError: a splat holds NaN or infinity, or the file cannot be written.
+    """
+    table = _table(splats)
+    broken = int((~np.isfinite(table)).any(axis=1).sum())
+    if broken:
+        raise DataError(
+            f"{broken} of {len(table)} splats hold NaN or infinite values; {path} is not written: "
+            "export an earlier checkpoint or train again"
+        )
+    names = _column_names(3 * (splats.sh.shape[1] - 1))
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(table)}"]
+    header += [f"property float {name}" for name in names] + ["end_header", ""]
+    _write_atomically(path, "\n".join(header).encode("ascii") + table.tobytes())
+
+
+def read_ply(path: Path) -> Splats:
+    """Read a 3DGS PLY; its properties may come in any order and have any scalar type.
+
+    Raises:
+        DataError: the file cannot be read, is cut short or is not a binary PLY of splats.
+    """
+    try:
+        with path.open("rb") as file:
+            dtype, count = _read_header(path, file)
+            rest = _count_rest(path, dtype.names or ())
+            payload = file.read()
+    except OSError as error:
+        raise DataError(f"cannot read {path}: {error.strerror or error}") from error
+    if len(payload) < count * dtype.itemsize:
+        raise DataError(
+            f"{path} is cut short: {len(payload)} bytes of splats where its header announces "
+            f"{count} times {dtype.itemsize}; copy or export it again"
+        )
+    return _splats(np.frombuffer(payload[: count * dtype.itemsize], dtype), rest)
+
+
+def _column_names(rest: int) -> tuple[str, ...]:
+    """Return the standard columns with ``rest`` non-constant harmonics, in their order."""
+    rests = tuple(f"f_rest_{i}" for i in range(rest))
+    return _MEANS + _NORMALS + _DC + rests + _OPACITY + _SCALES + _QUATS
+
+
+def _table(splats: Splats) -> Array:
+    """Return the columns of the file, (N, 17 + 3 (K - 1)) little-endian float32."""
+    splats = splats.map(lambda tensor: tensor.detach().cpu())
+    columns = [
+        splats.means,
+        torch.zeros_like(splats.means),
+        splats.sh[:, 0],
+        splats.sh[:, 1:].transpose(1, 2).flatten(1),
+        splats.logit_opacities[:, None],
+        splats.log_scales,
+        _unit_quats(splats.quats),
+    ]
+    table = torch.cat([column.float() for column in columns], dim=1)
+    return table.numpy().astype("<f4", copy=False)
+
+
+def _unit_quats(quats: torch.Tensor) -> torch.Tensor:
+    """Return (N, 4) quaternions of unit length; zero turns nothing, like the identity."""
+    wide = quats.double()
+    length = wide.norm(dim=1, keepdim=True)
+    return torch.where(length == 0, wide.new_tensor([1.0, 0.0, 0.0, 0.0]), wide / length)
+
+
+def _write_atomically(path: Path, content: bytes) -> None:
+    """Write a file under another name, then rename it."""
+    part = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            part.write_bytes(content)
+            part.replace(path)
+        finally:
+            part.unlink(missing_ok=True)
+    except OSError as error:
+        raise DataError(
+            f"cannot write {path}: {error.strerror or error}; free space or choose another --out"
+        ) from error
+
+
+def _read_header(path: Path, file: BinaryIO) -> tuple[np.dtype[np.void], int]:
+    """Read up to and including ``end_header``; return the row's type and the number of rows."""
+    if file.readline(16).strip() != b"ply":
+        raise DataError(f"{path} is not a PLY file; its first line is not 'ply'")
+    binary, count = False, None
+    element, fields = "", list[tuple[str, str]]()
+    while (line := file.readline(1024)) and line.strip() != b"end_header":
+        match line.decode("ascii", "replace").split():
+            case ["format", "binary_little_endian", "1.0"]:
+                binary = True
+            case ["element", "vertex", number] if element == "" and number.isdecimal():
+                element, count = "vertex", int(number)
+            case ["element", name, _]:
+                element = name
+            case ["property", kind, name] if element == "vertex" and kind in _TYPES:
+                fields.append((name, _TYPES[kind]))
+            case ["property", *_] if element == "vertex":
+                raise DataError(f"{path}: a vertex property has no fixed size: {line!r}")
+    if not (line and binary and count is not None):
+        raise DataError(f"{path} is not a binary_little_endian PLY that starts with vertices")
+    if len(dict(fields)) != len(fields):
+        raise DataError(f"{path} names a vertex property twice")
+    return np.dtype(fields), count
+
+
+def _count_rest(path: Path, known: tuple[str, ...]) -> int:
+    """Return the number of non-constant harmonics; raise DataError unless all columns are there."""
+    rest = sum(name.startswith("f_rest_") for name in known)
+    if rest not in _REST_COUNTS:
+        raise DataError(f"{path} has {rest} f_rest properties; allowed: 0, 9, 24, 45")
+    required = set(_column_names(rest)) - set(_NORMALS)
+    if missing := sorted(required - set(known)):
+        raise DataError(f"{path} is not a PLY of splats; it lacks {', '.join(missing)}")
+    return rest
+
+
+def _splats(rows: NDArray[np.void], rest: int) -> Splats:
+    """Turn the rows of a file with ``rest`` non-constant harmonics into splats."""
+
+    def columns(*names: str) -> torch.Tensor:
+        stacked = [torch.from_numpy(rows[name].astype(np.float32)) for name in names]
+        return torch.stack(stacked, dim=1) if stacked else torch.empty(len(rows), 0)
+
+    harmonics = columns(*(f"f_rest_{i}" for i in range(rest)))
+    higher = harmonics.reshape(len(rows), 3, rest // 3).transpose(1, 2)
+    return Splats(
+        means=columns(*_MEANS),
+        quats=columns(*_QUATS),
+        log_scales=columns(*_SCALES),
+        logit_opacities=columns(*_OPACITY)[:, 0],
+        sh=torch.cat([columns(*_DC)[:, None], higher], dim=1),
+    )

@@ -1,0 +1,1 @@
+"""Plane grids and small networks that motions share."""

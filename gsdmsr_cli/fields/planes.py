@@ -1,0 +1,201 @@
+"""Plane grids over space and time (HexPlane, Cao & Johnson 2023; K-Planes, Fridovich-Keil 2023)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.autograd import Function
+from torch.autograd.function import once_differentiable
+
+from gsdmsr_cli.kernels import planes as kernels
+from gsdmsr_cli.kernels.simd import LANES
+from gsdmsr_cli.tensors import array, has_kernels
+
+_SPACE_AXES = ((0, 1), (0, 2), (1, 2))
+
+
+class Level(NamedTuple):
+    """One resolution of a grid of C channels, C a multiple of 16.
+
+    Attributes:
+        space: (3, C / 16, R, R, 16) the planes xy, xz, yz; the second axis of a plane comes first.
+        time: (3, C / 16, T, R, 16) the planes of x, y, z against time.
+    """
+
+    space: Tensor
+    time: Tensor
+
+    @property
+    def channels(self) -> int:
+        """Number of features the level adds."""
+        return int(self.space.shape[1]) * LANES
+
+
+def new_level(resolution: int, times: int, channels: int, generator: torch.Generator) -> Level:
+    """Return a level that starts as 4D-GS's do: space uniform in [0.1, 0.5], time 1.
+
+    Args:
+        resolution: nodes along each spatial axis, at least 2.
+        times: nodes in time, at least 2.
+        channels: a multiple of 16.
+        generator: source of the random values.
+    """
+    if channels % LANES or channels < LANES or resolution < 2 or times < 2:
+        raise ValueError(
+            f"a level has a multiple of {LANES} channels and at least 2 nodes along each axis, "
+            f"not {channels} channels, {resolution} nodes in space and {times} in time"
+        )
+    chunks = channels // LANES
+    space = torch.rand(3, chunks, resolution, resolution, LANES, generator=generator)
+    return Level(space * 0.4 + 0.1, torch.ones(3, chunks, times, resolution, LANES))
+
+
+def lookup(levels: Sequence[Level], points: Tensor, time: float) -> Tensor:
+    """Return the features (N, sum of channels) of points (N, 3) in [-1, 1]^3 at time in [-1, 1].
+
+    Each level gives the product of six samples; levels are concatenated. Coordinates outside
+    [-1, 1] are clamped to the border and pass no gradient.
+    """
+    tensors = [tensor for level in levels for tensor in level]
+    if has_kernels(points, *tensors):
+        features: Tensor = _Lookup.apply(points.contiguous(), time, *tensors)
+        return features
+    return lookup_twin(levels, points, time)
+
+
+def lookup_twin(levels: Sequence[Level], points: Tensor, time: float) -> Tensor:
+    """Return what ``lookup`` does, in plain torch, for any device and dtype."""
+    when = points.new_tensor(time)
+    return torch.cat([_sample_level(level, points, when) for level in levels], dim=1)
+
+
+def _cell(x: Tensor, size: int) -> tuple[Tensor, Tensor]:
+    u = (x.clamp(-1, 1) + 1) * 0.5 * (size - 1)
+    lower = u.detach().floor().clamp(0, size - 2).long()
+    return lower, u - lower
+
+
+def _sample_level(level: Level, points: Tensor, when: Tensor) -> Tensor:
+    size = level.space.shape[3]
+    lower, upper_weight = _cell(points, size)
+    moment, later = _cell(when, level.time.shape[2])
+    lines = torch.lerp(level.time[:, :, moment], level.time[:, :, moment + 1], later)
+    feature = points.new_ones(level.space.shape[1], len(points), LANES)
+    for plane, (first, second) in zip(level.space, _SPACE_AXES, strict=True):
+        x, y = lower[:, first], lower[:, second]
+        wx, wy = upper_weight[:, first, None], upper_weight[:, second, None]
+        low = torch.lerp(plane[:, y, x], plane[:, y, x + 1], wx)
+        high = torch.lerp(plane[:, y + 1, x], plane[:, y + 1, x + 1], wx)
+        feature = feature * torch.lerp(low, high, wy)
+    for line, axis in zip(lines, range(3), strict=True):
+        x, w = lower[:, axis], upper_weight[:, axis, None]
+        feature = feature * torch.lerp(line[:, x], line[:, x + 1], w)
+    return feature.transpose(0, 1).reshape(len(points), -1)
+
+
+class _Lookup(Function):
+    """All levels at one time, written side by side into one array of features."""
+
+    @staticmethod
+    def forward(ctx: Any, points: Tensor, time: float, *tensors: Tensor) -> Tensor:
+        levels = [Level(*pair) for pair in zip(tensors[::2], tensors[1::2], strict=True)]
+        features = torch.empty(len(points), sum(level.channels for level in levels))
+        lines, offset = [], 0
+        for level in levels:
+            _, chunks, _, size, _ = level.time.shape
+            line = np.empty((3, chunks, size, LANES), np.float32)
+            kernels.collapse_time(array(level.time), time, line)
+            kernels.lookup(array(points), array(level.space), line, array(features), offset)
+            lines.append(line)
+            offset += level.channels
+        ctx.time, ctx.lines = time, lines
+        ctx.save_for_backward(points, *tensors)
+        return features
+
+    @staticmethod
+    @once_differentiable  # type: ignore[untyped-decorator]
+    def backward(ctx: Any, d_features: Tensor) -> tuple[Tensor | None, ...]:
+        points, *tensors = ctx.saved_tensors
+        d_features = d_features.contiguous()
+        wanted = ctx.needs_input_grad[0]
+        d_points = torch.zeros_like(points) if wanted else None
+        gradients: list[Tensor] = []
+        offset = 0
+        for space, time, line in zip(tensors[::2], tensors[1::2], ctx.lines, strict=True):
+            chunks = space.shape[1]
+            d_space, d_time = torch.empty_like(space), torch.empty_like(time)
+            d_line = np.empty_like(line)
+            share = torch.empty((chunks, len(points), 3) if wanted else (0, 0, 0))
+            kernels.lookup_backward(
+                array(points), array(space), line, array(d_features), offset,
+                array(d_space), d_line, array(share),
+            )  # fmt: skip
+            kernels.spread_time(d_line, ctx.time, array(d_time))
+            if d_points is not None:
+                d_points += share.sum(0)
+            gradients += [d_space, d_time]
+            offset += chunks * LANES
+        return d_points, None, *gradients
+
+
+def penalty(
+    levels: Sequence[Level], space_weight: float, smooth_weight: float, still_weight: float
+) -> Tensor:
+    """Return the plane regularisers of HexPlane and 4D-GS, summed over levels and planes.
+
+    Each is a mean over a plane: ``space_weight`` times squared first differences along both axes
+    of the spatial planes, ``smooth_weight`` times squared second differences in time and
+    ``still_weight`` times |1 - value| of the temporal ones.
+    """
+    tensors = [tensor for level in levels for tensor in level]
+    weights = space_weight, smooth_weight, still_weight
+    if has_kernels(*tensors):
+        value: Tensor = _Penalty.apply(weights, *tensors)
+        return value
+    return penalty_twin(levels, *weights)
+
+
+def penalty_twin(
+    levels: Sequence[Level], space_weight: float, smooth_weight: float, still_weight: float
+) -> Tensor:
+    """Return what ``penalty`` does, in plain torch, for any device and dtype."""
+    total = levels[0].space.new_zeros(())
+    for space, time in levels:
+        down = (space[:, :, 1:] - space[:, :, :-1]).square().mean()
+        right = (space[:, :, :, 1:] - space[:, :, :, :-1]).square().mean()
+        total = total + 3 * space_weight * (down + right)
+        if time.shape[2] > 2:
+            bend = time[:, :, 2:] - 2 * time[:, :, 1:-1] + time[:, :, :-2]
+            total = total + 3 * smooth_weight * bend.square().mean()
+        total = total + 3 * still_weight * (1 - time).abs().mean()
+    return total
+
+
+class _Penalty(Function):
+    """The value and, in the same pass over memory, the gradients."""
+
+    @staticmethod
+    def forward(ctx: Any, weights: tuple[float, float, float], *tensors: Tensor) -> Tensor:
+        space_weight, smooth_weight, still_weight = weights
+        total, gradients = 0.0, []
+        for space, time in zip(tensors[::2], tensors[1::2], strict=True):
+            d_space, d_time = torch.empty_like(space), torch.empty_like(time)
+            sums = np.empty((2, 3 * space.shape[1]))
+            kernels.space_penalty(array(space), space_weight, array(d_space), sums[0])
+            kernels.time_penalty(
+                array(time), smooth_weight, still_weight, array(d_time), sums[1]
+            )
+            total += float(sums.sum())
+            gradients += [d_space, d_time]
+        ctx.gradients = gradients
+        return torch.tensor(total)
+
+    @staticmethod
+    @once_differentiable  # type: ignore[untyped-decorator]
+    def backward(ctx: Any, d_value: Tensor) -> tuple[Tensor | None, ...]:
+        scale = float(d_value)
+        return None, *(g if scale == 1.0 else g.mul_(scale) for g in ctx.gradients)

@@ -1,0 +1,46 @@
+"""One file per input format."""
+
+from __future__ import annotations
+
+from itertools import islice
+from pathlib import Path
+
+from gsdmsr_cli import plugins
+from gsdmsr_cli.errors import DataError
+from gsdmsr_cli.scene import Scene
+
+
+def read_scene(folder: Path) -> Scene:
+    """Read a data folder with the first format that recognises it.
+
+    A format is a module of this package with ``SIGN: str``, the files that tell it, for messages;
+    ``matches(folder: Path) -> bool``; and ``read(folder: Path) -> Scene``, which raises DataError.
+
+    Raises:
+        DataError: there is no such folder, no format recognises it, or its content is unusable.
+    """
+    if not folder.is_dir():
+        problem = "is a file, not a folder" if folder.exists() else "does not exist"
+        raise DataError(f"data folder {folder} {problem}; give the folder of a capture")
+    try:
+        return _read(folder)
+    except OSError as error:
+        raise DataError(f"data folder {folder} cannot be read: {error}") from error
+
+
+def _read(folder: Path) -> Scene:
+    formats = [(name, plugins.load(__name__, name)) for name in plugins.names(__name__)]
+    for _, module in formats:
+        if module.matches(folder):
+            scene: Scene = module.read(folder)
+            return scene
+    known = "; ".join(f"{name} ({module.SIGN})" for name, module in formats)
+    raise DataError(
+        f"data folder {folder} has no known layout; found {_listing(folder)}; known: {known}"
+    )
+
+
+def _listing(folder: Path) -> str:
+    entries = sorted(islice((entry.name for entry in folder.iterdir()), 1000))
+    shown = ", ".join(entries[:5]) or "nothing"
+    return f"{shown} and more" if len(entries) > 5 else shown

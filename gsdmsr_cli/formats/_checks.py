@@ -1,0 +1,156 @@
+"""What every reader checks before it trusts a file: numbers, poses, paths and JSON."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from collections.abc import Iterable
+from pathlib import Path, PurePosixPath, PureWindowsPath
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gsdmsr_cli.errors import DataError
+
+EXTENSIONS = (".png", ".jpg", ".jpeg")
+"""Tried in turn after a picture's path that names no file as it stands."""
+
+RIGID_TOLERANCE = 1e-3
+"""Largest deviation of R^T R from the identity in a pose."""
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """Return the object in a JSON file.
+
+    Raises:
+        DataError: the file cannot be read, is not JSON, or holds something else than an object.
+    """
+    try:
+        document = json.loads(path.read_bytes().decode("utf-8-sig"))
+    except json.JSONDecodeError as error:
+        where = f"line {error.lineno}, column {error.colno}"
+        raise DataError(f"{path}: malformed JSON at {where}: {error.msg}") from error
+    except OSError as error:
+        raise DataError(f"{path} cannot be read: {error.strerror or error}") from error
+    except (ValueError, RecursionError) as error:
+        raise DataError(f"{path}: malformed JSON: {error}") from error
+    return mapping(document, str(path))
+
+
+def mapping(value: object, where: str) -> dict[str, Any]:
+    """Return ``value`` if it is a JSON object, else raise DataError."""
+    if not isinstance(value, dict):
+        raise DataError(f"{where}: {_shown(value)} found where a JSON object {{...}} must stand")
+    return value
+
+
+def sequence(value: object, where: str) -> list[Any]:
+    """Return ``value`` if it is a JSON list, else raise DataError."""
+    if not isinstance(value, list):
+        raise DataError(f"{where}: {_shown(value)} found where a JSON list [...] must stand")
+    return value
+
+
+def number(value: object, where: str) -> float:
+    """Return ``value`` if it is a finite number, else raise DataError."""
+    if isinstance(value, (int, float)) and not isinstance(value, bool):
+        try:
+            result = float(value)
+        except OverflowError:
+            result = math.inf
+        if math.isfinite(result):
+            return result
+    raise DataError(f"{where} is {_shown(value)}; it must be a finite number")
+
+
+def unit_time(value: object, where: str) -> float:
+    """Return ``value`` if it is a number in [0, 1], else raise DataError."""
+    time = number(value, where)
+    if not 0 <= time <= 1:
+        raise DataError(f"{where} is {time}; it must lie in [0, 1]: divide all by the last time")
+    return time
+
+
+def rigid_pose(value: object, where: str) -> NDArray[np.float64]:
+    """Return a (4, 4) rigid transform from nested lists.
+
+    Raises:
+        DataError: it is not 4 x 4 finite numbers, or not a rotation with a translation.
+    """
+    rows = [sequence(row, where) for row in sequence(value, where)]
+    if [len(row) for row in rows] != [4, 4, 4, 4]:
+        raise DataError(f"{where} is not 4 x 4 numbers")
+    pose = np.array([[number(entry, f"an entry of {where}") for entry in row] for row in rows])
+    if not np.allclose(pose[3], [0, 0, 0, 1], rtol=0, atol=1e-6):
+        raise DataError(f"{where} is not a rigid pose: its last row is not 0 0 0 1")
+    rotation = pose[:3, :3]
+    gram = rotation.T @ rotation
+    scale = math.sqrt(np.trace(gram) / 3)
+    if np.abs(gram - np.eye(3)).max() > RIGID_TOLERANCE:
+        uniform = np.abs(gram - scale**2 * np.eye(3)).max() <= RIGID_TOLERANCE * scale**2
+        problem = (
+            f"its rotation is scaled by {scale:.6g}; divide it by that"
+            if uniform and scale > 0
+            else "the columns of its rotation are not orthonormal"
+        )
+        raise DataError(f"{where} is not a rigid pose: {problem}")
+    if np.linalg.det(rotation) < 0:
+        raise DataError(f"{where} is not a rigid pose: its rotation mirrors (determinant -1)")
+    return pose
+
+
+def picture_path(root: Path, text: object, where: str) -> Path:
+    """Return the picture that ``text`` names relative to ``root``, whose extension may be missing.
+
+    Raises:
+        DataError: it names nothing, or something outside of ``root``.
+    """
+    if not isinstance(text, str) or not text.strip():
+        raise DataError(f"{where} is {_shown(text)}; it must name a picture")
+    relative = text.replace("\\", "/")
+    if PurePosixPath(relative).is_absolute() or PureWindowsPath(relative).drive:
+        raise DataError(f"{where} is {_shown(text)}; it must be relative to {root}")
+    try:
+        inside = root.resolve()
+        for extension in ("", *EXTENSIONS):
+            path = root / (relative + extension)
+            if not path.resolve().is_relative_to(inside):
+                raise DataError(f"{where} is {_shown(text)}, which leads out of {root}")
+            if path.is_file():
+                return path
+    except (OSError, ValueError, RuntimeError) as error:  # Too long, a null byte, a loop of links.
+        raise DataError(f"{where} is {_shown(text)}, which is not a usable path") from error
+    raise DataError(
+        f"{where}: image {root / relative} does not exist, nor with {', '.join(EXTENSIONS)}"
+    )
+
+
+def unique_names(names: Iterable[str]) -> list[str]:
+    """Return the names in order, with _2, _3, ... after those that were there before."""
+    names = list(names)
+    taken = set(names)
+    seen: set[str] = set()
+    result = []
+    for name in names:
+        unique, count = name, 1
+        while unique in seen or (count > 1 and unique in taken):
+            count += 1
+            unique = f"{name}_{count}"
+        seen.add(unique)
+        result.append(unique)
+    return result
+
+
+def fingerprint(paths: Iterable[Path]) -> str:
+    """Return 16 hexadecimal digits of the SHA-256 over the files' bytes."""
+    digest = hashlib.sha256()
+    for path in paths:
+        digest.update(path.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+def _shown(value: object) -> str:
+    text = repr(value)
+    return text if len(text) <= 60 else f"{text[:57]}..."

@@ -1,0 +1,199 @@
+"""The D-NeRF layout: ``transforms_{train,val,test}.json``, Blender's axes, a time per frame."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gsdmsr_cli.camera import Camera
+from gsdmsr_cli.errors import DataError
+from gsdmsr_cli.formats import _checks as checks
+from gsdmsr_cli.imaging import image_size
+from gsdmsr_cli.scene import SPLITS, Scene, View
+
+SIGN = "transforms_train.json"
+
+BOUND = 1.3
+"""Half edge of the box in which D-NeRF's objects stand (METHODS 0.8) [world units]."""
+
+_CAMERA_KEYS = ("camera_angle_x", "camera_angle_y", "fl_x", "fl_y", "cx", "cy", "w", "h")
+_DISTORTION_KEYS = ("k1", "k2", "k3", "k4", "p1", "p2")
+
+
+def matches(folder: Path) -> bool:
+    """Tell whether ``folder`` holds the JSON file of any split."""
+    return any(path.is_file() for path in _paths(folder).values())
+
+
+def read(folder: Path) -> Scene:
+    """Read a folder in D-NeRF's layout; the val and test splits may be missing.
+
+    Also read: instant-ngp's intrinsics (``fl_x`` ...), of all frames or of one, and NVFi's "Dynamic
+    Object" files, where ``data`` holds one entry per camera and that its ``frames``.
+
+    Raises:
+        DataError: something in it cannot be used; the message names the file and frame.
+    """
+    paths = {split: path for split, path in _paths(folder).items() if path.is_file()}
+    if "train" not in paths:
+        found = ", ".join(path.name for path in paths.values()) or "none of its kind"
+        raise DataError(f"{folder}: no transforms_train.json; found {found}")
+    views = [view for split, path in paths.items() for view in _read_split(folder, split, path)]
+    if not any(view.split == "train" for view in views):
+        raise DataError(f"{paths['train']}: no train frames; at least one is needed")
+    _check_sizes(views)
+    return Scene(
+        root=folder,
+        layout="dnerf",
+        views=tuple(views),
+        points=np.zeros((0, 3), np.float32),
+        colours=np.zeros((0, 3), np.float32),
+        duration=None,
+        bound=BOUND,
+        fingerprint=checks.fingerprint(paths.values()),
+    )
+
+
+def _paths(folder: Path) -> dict[str, Path]:
+    return {split: folder / f"transforms_{split}.json" for split in SPLITS}
+
+
+def _read_split(folder: Path, split: str, path: Path) -> list[View]:
+    views = [
+        _read_view(folder, split, fields, where)
+        for where, fields in _frames(checks.read_json(path), str(path))
+    ]
+    names = checks.unique_names(view.name for view in views)
+    return [replace(view, name=name) for view, name in zip(views, names, strict=True)]
+
+
+def _frames(document: dict[str, Any], where: str) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Yield every frame's place in the file and its fields.
+
+    A frame inherits what it does not say itself from its camera's entry and from the top level.
+    """
+    shared = {k: v for k, v in document.items() if k in _CAMERA_KEYS + _DISTORTION_KEYS}
+    if "frames" in document:
+        listed = checks.sequence(document["frames"], f"{where}: frames")
+        entries = [(f"frame {i}", entry) for i, entry in enumerate(listed)]
+    elif "data" in document:
+        cameras = checks.mapping(document["data"], f"{where}: data")
+        entries = [(f"camera '{name}'", entry) for name, entry in cameras.items()]
+    else:
+        raise DataError(f"{where}: neither 'frames' nor 'data' in it")
+    for label, entry in entries:
+        place = f"{where}: {label}"
+        fields = shared | checks.mapping(entry, place)
+        if "frames" in fields:
+            yield from _camera_frames(fields, place)
+        else:
+            yield place, fields
+
+
+def _camera_frames(camera: dict[str, Any], where: str) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Yield the frames of one camera's entry.
+
+    As in NVFi's loader, a camera whose frames have no time was sampled evenly from 0 to 1.
+    """
+    listed = checks.sequence(camera["frames"], f"{where}: frames")
+    frames = [checks.mapping(f, f"{where}, frame {i}") for i, f in enumerate(listed)]
+    timed = "time" in camera or len(frames) < 2 or any("time" in frame for frame in frames)
+    shared = {key: value for key, value in camera.items() if key != "frames"}
+    for i, frame in enumerate(frames):
+        time = {} if timed else {"time": i / (len(frames) - 1)}
+        yield f"{where}, frame {i}", shared | time | frame
+
+
+def _read_view(folder: Path, split: str, fields: dict[str, Any], where: str) -> View:
+    for key in ("file_path", "transform_matrix"):
+        if key not in fields:
+            raise DataError(f"{where}: no '{key}'; every frame needs one")
+    where = f"{where} ({fields['file_path']!s:.60})"
+    if "time" not in fields:
+        raise DataError(f"{where}: no 'time'; every frame of a moving scene needs one in [0, 1]")
+    path = checks.picture_path(folder, fields["file_path"], f"{where}: file_path")
+    pose = checks.rigid_pose(fields["transform_matrix"], f"{where}: transform_matrix")
+    return View(
+        name=path.stem,
+        camera=_camera(fields, _world_to_camera(pose), image_size(path), where),
+        time=checks.unit_time(fields["time"], f"{where}: time"),
+        split=split,
+        image_path=path,
+    )
+
+
+def _world_to_camera(pose: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Invert a camera-to-world pose in OpenGL axes (y up, z backward) into OpenCV axes."""
+    flipped = pose @ np.diag([1.0, -1.0, -1.0, 1.0])
+    return np.asarray(np.linalg.inv(flipped), dtype=np.float64)
+
+
+def _camera(
+    fields: dict[str, Any],
+    world_to_camera: NDArray[np.float64],
+    size: tuple[int, int],
+    where: str,
+) -> Camera:
+    """Return the camera at the picture's ``size`` (width, height); w and h may say another."""
+    for key in _DISTORTION_KEYS:
+        if checks.number(fields.get(key, 0), f"{where}: {key}") != 0:
+            raise DataError(f"{where}: lens distortion ({key}); undistort the pictures first")
+    width, height = (_pixels(fields, key, n, where) for key, n in zip("wh", size, strict=True))
+    # Pictures may have been shrunk after w and h were written, but not cropped.
+    if abs(height * size[0] / width - size[1]) > 1:
+        raise DataError(
+            f"{where}: the image is {size[0]} x {size[1]} px, but w x h is {width} x {height}"
+        )
+    fx = _focal(fields, "x", width, where)
+    if fx is None:
+        raise DataError(f"{where}: no 'camera_angle_x' and no 'fl_x'; one of them is needed")
+    camera = Camera(
+        world_to_camera=world_to_camera,
+        fx=fx,
+        fy=_focal(fields, "y", height, where) or fx,
+        cx=checks.number(fields.get("cx", width / 2), f"{where}: cx"),
+        cy=checks.number(fields.get("cy", height / 2), f"{where}: cy"),
+        width=width,
+        height=height,
+    )
+    return camera.resized(*size)
+
+
+def _pixels(fields: dict[str, Any], key: str, default: int, where: str) -> int:
+    value = checks.number(fields.get(key, default), f"{where}: {key}")
+    if value < 1 or value != int(value):
+        raise DataError(f"{where}: {key} is {value}; it must be a whole number of pixels")
+    return int(value)
+
+
+def _focal(fields: dict[str, Any], axis: str, size: int, where: str) -> float | None:
+    """Return the focal length [px] along ``axis``, or None if the fields do not give it."""
+    length, angle = f"fl_{axis}", f"camera_angle_{axis}"
+    if length in fields:
+        focal = checks.number(fields[length], f"{where}: {length}")
+        if focal <= 0:
+            raise DataError(f"{where}: {length} is {focal}; it must be above 0")
+        return focal
+    if angle not in fields:
+        return None
+    field_of_view = checks.number(fields[angle], f"{where}: {angle}")
+    if not 0 < field_of_view < math.pi:
+        raise DataError(f"{where}: {angle} is {field_of_view}; it must lie in (0, pi) radians")
+    return 0.5 * size / math.tan(field_of_view / 2)
+
+
+def _check_sizes(views: list[View]) -> None:
+    first = views[0]
+    size = (first.camera.width, first.camera.height)
+    for view in views:
+        if (view.camera.width, view.camera.height) != size:
+            raise DataError(
+                f"image {view.image_path} is {view.camera.width} x {view.camera.height} px, but "
+                f"{first.image_path} is {size[0]} x {size[1]}; all frames must have one size"
+            )

@@ -1,0 +1,222 @@
+"""Pictures and video on disk; the one module that imports cv2 and OpenImageIO."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import struct
+import uuid
+from collections.abc import Iterable, Iterator
+from itertools import chain
+from pathlib import Path
+
+# cv2 comes first: pycolmap exports zlib and png symbols of its own, and loading it before cv2 makes
+# every later PNG write abort the process. Whoever needs pycolmap imports this module before it.
+import cv2
+import numpy as np
+import OpenImageIO
+from numpy.typing import NDArray
+
+from gsdmsr_cli.errors import DataError, GsdmsrError
+
+_PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+
+
+def read_image(path: Path) -> NDArray[np.uint8]:
+    """Return the pixels of ``path``, (H, W, C) with C = 1 (grey), 3 (RGB) or 4 (RGBA).
+
+    Alpha is straight (unassociated), exactly as stored; 16-bit files are scaled to 8 bits. Grey
+    with alpha becomes RGBA. An orientation tag is ignored: cameras refer to pixels as stored.
+
+    Raises:
+        DataError: the file is missing, truncated, damaged or not a picture.
+    """
+    source = _open(path)
+    pixels = source.read_image(OpenImageIO.UINT8)
+    # A truncated JPEG decodes with its missing rows in grey and tells so only in the error text.
+    message = source.geterror()
+    source.close()
+    if pixels is None or message:
+        raise DataError(_unreadable(path, message))
+    channels = pixels.shape[2]
+    if channels == 2:
+        pixels = pixels[..., [0, 0, 0, 1]]
+    elif channels > 4:
+        raise DataError(f"image {path} has {channels} channels; allowed are grey, RGB and RGBA")
+    return np.ascontiguousarray(pixels)
+
+
+def image_size(path: Path) -> tuple[int, int]:
+    """Return (width, height) [px] of ``path`` without decoding its pixels.
+
+    Raises:
+        DataError: the file is missing or has no readable header, or is a PNG without an end.
+    """
+    source = _open(path)
+    spec = source.spec()
+    source.close()
+    return spec.width, spec.height
+
+
+def write_png(path: Path, image: NDArray[np.uint8]) -> None:
+    """Write (H, W, 1 | 3 | 4) pixels, grey, RGB or straight RGBA, as a PNG, whole or not at all.
+
+    Raises:
+        DataError: the file cannot be written, for example because the disk is full.
+    """
+    order = {1: [0], 3: [2, 1, 0], 4: [2, 1, 0, 3]}[image.shape[2]]
+    encoded = cv2.imencode(".png", np.ascontiguousarray(image[..., order]))[1]
+    with _replacing(path) as temporary:
+        temporary.write_bytes(encoded.tobytes())
+
+
+def composite(
+    image: NDArray[np.uint8], background: tuple[float, float, float]
+) -> NDArray[np.float32]:
+    """Return (H, W, 1 | 3 | 4) straight-alpha pixels over ``background``, (H, W, 3) in [0, 1]."""
+    if image.shape[2] == 1:
+        image = np.repeat(image, 3, axis=2)
+    if image.shape[2] == 3:
+        return image.astype(np.float32) / np.float32(255)
+    # Whole planes are four times as fast as strided RGBA.
+    *colours, opacity = cv2.split(image)
+    alpha = opacity / np.float32(255)
+    weight, rest = alpha / np.float32(255), 1 - alpha
+    planes = [
+        colour * weight + rest * np.float32(behind)
+        for colour, behind in zip(colours, background, strict=True)
+    ]
+    return np.asarray(cv2.merge(planes), dtype=np.float32)
+
+
+def resize_area(image: NDArray[np.float32], width: int, height: int) -> NDArray[np.float32]:
+    """Return (H, W, 3) pixels shrunk to (height, width, 3), each the mean of the area it covers."""
+    resized = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
+    return np.asarray(resized, dtype=np.float32)
+
+
+def write_webm(path: Path, frames: Iterable[NDArray[np.uint8]], fps: float) -> None:
+    """Write (H, W, 3) RGB frames as a VP8 video that browsers play, whole or not at all.
+
+    VP8 needs even sizes; an odd last row or column is doubled.
+
+    Raises:
+        GsdmsrError: there are no frames, or OpenCV has no VP8 encoder.
+        DataError: the file cannot be written, for example because the disk is full.
+        ValueError: the frames differ in size.
+    """
+    frames = iter(frames)
+    first = next(frames, None)
+    if first is None:
+        raise GsdmsrError(f"{path}: a video needs at least one frame")
+    with _replacing(path) as temporary:
+        temporary.touch()  # The encoder does not say why it cannot open a file; this does.
+        written = _encode(temporary, chain([first], frames), first.shape, fps)
+        # OpenCV drops what it could not write without a word, so count what is really there.
+        if _count_frames(temporary) != written:
+            raise DataError(f"cannot write {path}: the file is incomplete; is the disk full?")
+
+
+def _open(path: Path) -> OpenImageIO.ImageInput:
+    try:
+        if not path.is_file():
+            raise DataError(f"image {path} does not exist or is not a file")
+        truncated = _is_truncated_png(path)
+    except OSError as error:
+        raise DataError(f"image {path} cannot be read: {error.strerror or error}") from error
+    if truncated:
+        raise DataError(_unreadable(path, "the PNG ends too early"))
+    # Without this hint OpenImageIO premultiplies by alpha, in 8 bits.
+    config = OpenImageIO.ImageSpec()
+    config["oiio:UnassociatedAlpha"] = 1
+    source = OpenImageIO.ImageInput.open(str(path), config)
+    if source is None:
+        raise DataError(_unreadable(path, OpenImageIO.geterror()))
+    return source
+
+
+def _is_truncated_png(path: Path) -> bool:
+    """Tell whether ``path`` is a PNG whose chunks do not reach the end marker.
+
+    The decoder would notice too, but only with the pixels, and libpng then prints to stderr.
+    """
+    with path.open("rb") as file:
+        if file.read(8) != _PNG_SIGNATURE:
+            return False
+        while len(header := file.read(8)) == 8:
+            length, kind = struct.unpack(">I4s", header)
+            if kind == b"IEND":
+                return False
+            file.seek(length + 4, os.SEEK_CUR)
+    return True
+
+
+def _unreadable(path: Path, message: str) -> str:
+    reason = " ".join(message.split()) or "not a picture"
+    return f"image {path} is damaged or not a picture ({reason}); restore the file"
+
+
+@contextlib.contextmanager
+def _replacing(path: Path) -> Iterator[Path]:
+    """Yield a new path beside ``path`` that takes its place if the block succeeds."""
+    temporary = path.with_name(f".{path.stem}.{uuid.uuid4().hex}{path.suffix}")
+    try:
+        yield temporary
+        temporary.replace(path)
+    except OSError as error:
+        raise DataError(f"cannot write {path}: {error.strerror or error}") from error
+    finally:
+        with contextlib.suppress(OSError):
+            temporary.unlink()
+
+
+def _encode(
+    path: Path, frames: Iterable[NDArray[np.uint8]], shape: tuple[int, ...], fps: float
+) -> int:
+    """Write the frames to ``path`` and return how many there were."""
+    height, width, _ = shape
+    pad = ((0, height % 2), (0, width % 2), (0, 0))
+    codec = cv2.VideoWriter.fourcc(*"VP80")
+    size = (width + width % 2, height + height % 2)
+    with _silent_stderr():
+        writer = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, codec, float(fps), size)
+    if not writer.isOpened():
+        raise GsdmsrError(
+            f"OpenCV cannot encode VP8 at {size[0]} x {size[1]}, {fps} frames/s; write PNG frames"
+        )
+    written = 0
+    try:
+        for frame in frames:
+            if frame.shape != shape:
+                raise ValueError(f"frame {written} has shape {frame.shape}, not {shape}")
+            writer.write(cv2.cvtColor(np.pad(frame, pad, mode="edge"), cv2.COLOR_RGB2BGR))
+            written += 1
+    finally:
+        writer.release()
+    return written
+
+
+def _count_frames(path: Path) -> int:
+    capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
+    count = 0
+    while capture.grab():
+        count += 1
+    capture.release()
+    return count
+
+
+@contextlib.contextmanager
+def _silent_stderr() -> Iterator[None]:
+    """Drop what C code prints: OpenCV tells every time, and wrongly, that .webm has no VP80 tag."""
+    try:
+        saved = os.dup(2)
+    except OSError:  # The process has no stderr, so there is nothing to silence.
+        yield
+        return
+    try:
+        with Path(os.devnull).open("w") as nowhere:
+            os.dup2(nowhere.fileno(), 2)
+        yield
+    finally:
+        os.dup2(saved, 2)
+        os.close(saved)

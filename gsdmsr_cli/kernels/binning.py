@@ -1,0 +1,172 @@
+"""Assigns splats to the 16 x 16 tiles they touch, front to back in every tile.
+
+The splats are sorted by depth once; each thread then appends the tiles of its share of the sorted
+splats to its own list, and a stable scatter brings the lists into tile order. So nothing is sorted
+per tile, and the order inside a tile is that of depth, however many threads there are.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numba import float32, prange
+from numpy.typing import NDArray
+
+from gsdmsr_cli.kernels.jit import inline, parallel, serial, threads
+from gsdmsr_cli.kernels.projection import ROUNDING, pixel_range
+from gsdmsr_cli.splatting_constants import ALPHA_MIN, TILE
+
+_ALPHA_MIN = float32(ALPHA_MIN)
+_ROUNDING = float32(ROUNDING)
+_HALF = float32(0.5)
+
+
+class Bins(NamedTuple):
+    """Which splats touch which tile.
+
+    Attributes:
+        entries: (E, 3) int32 in tile order: splat, first | last << 8 row inside the tile, slot.
+            Slots number the same entries splat by splat, so that sums over a splat are contiguous.
+        starts: (tiles + 1,) int32, where each tile's entries start; tiles are row by row.
+        busiest: (tiles,) int32, the tiles by falling number of entries.
+        splats: (n,) int32, the drawn splats, front to back.
+        slots: (n, 2) int64, the first slot of each of ``splats`` and the one after its last.
+        slot_count: an upper bound of all slots.
+    """
+
+    entries: NDArray[np.int32]
+    starts: NDArray[np.int32]
+    busiest: NDArray[np.int32]
+    splats: NDArray[np.int32]
+    slots: NDArray[np.int64]
+    slot_count: int
+
+
+def depth_order(depths: NDArray[np.float32], tiles: NDArray[np.int32]) -> NDArray[np.int32]:
+    """Return the rows with tiles > 0 by rising depth, ties by row; depths are positive there."""
+    rows = np.flatnonzero(tiles)
+    # the bits of a positive float sort like the float, so one integer carries depth and row
+    keys = depths[rows].view(np.uint32).astype(np.uint64) << np.uint64(32)
+    keys |= rows.astype(np.uint64)
+    keys.sort()
+    return keys.astype(np.uint32).view(np.int32)
+
+
+@inline
+def _rows_of_column(a, b, c, det, extent, reach, half_x, slope, low, high, centre_y, height):
+    """Return the pixel rows that the ellipse touches between x = low and x = high.
+
+    The ellipse is a x^2 + 2 b x y + c y^2 = extent around (0, centre_y); it reaches x = +-half_x
+    and is highest at x = slope, lowest at x = -slope. Its rim at x is
+    y = (-b x +- sqrt(extent c - det x^2)) / c.
+    """
+    low, high = max(low, -half_x), min(high, half_x)
+    x_top, x_bottom = min(max(-slope, low), high), min(max(slope, low), high)
+    inverse_c = float32(1) / c
+    y_top = (-b * x_top - math.sqrt(max(reach - det * x_top * x_top, float32(0)))) * inverse_c
+    y_bottom = (-b * x_bottom + math.sqrt(max(reach - det * x_bottom * x_bottom, float32(0)))) * (
+        inverse_c
+    )
+    first, _ = pixel_range(centre_y + y_top, float32(0), height)
+    _, last = pixel_range(centre_y + y_bottom, float32(0), height)
+    return first, last
+
+
+@parallel
+def _list_tiles(
+    order, means2d, conics, opacities, width, height, chunks, bounds, pairs, slots, counts, listed,
+):  # fmt: skip
+    """Append (splat, tile << 8 | rows) of every touched tile to the chunk's part of ``pairs``."""
+    n = order.shape[0]
+    columns = (width + TILE - 1) // TILE
+    for chunk in prange(chunks):
+        counts[chunk, :] = 0
+        at = bounds[n * chunk // chunks]
+        for k in range(n * chunk // chunks, n * (chunk + 1) // chunks):
+            i = order[k]
+            slots[k, 0] = at
+            a, b, c = conics[i, 0], conics[i, 1], conics[i, 2]
+            mx, my = means2d[i, 0], means2d[i, 1]
+            extent = float32(2) * math.log(opacities[i] / _ALPHA_MIN)
+            det = max(a * c - b * b, float32(1e-30))
+            half_x, half_y = math.sqrt(extent * c / det), math.sqrt(extent * a / det)
+            left, right = pixel_range(mx, half_x, width)
+            slope = -b / a * half_y
+            for tx in range(left // TILE, right // TILE + 1):
+                low = float32(tx * TILE) + _HALF - mx - _ROUNDING
+                high = float32(tx * TILE + TILE) - _HALF - mx + _ROUNDING
+                top, bottom = _rows_of_column(
+                    a, b, c, det, extent, extent * c, half_x, slope, low, high, my, height
+                )
+                if bottom < top:
+                    continue
+                for ty in range(top // TILE, bottom // TILE + 1):
+                    tile = ty * columns + tx
+                    first, last = max(top - ty * TILE, 0), min(bottom - ty * TILE, TILE - 1)
+                    counts[chunk, tile] += 1
+                    pairs[at, 0] = i
+                    pairs[at, 1] = tile << 8 | first << 4 | last
+                    at += 1
+            slots[k, 1] = at
+        listed[chunk] = at
+
+
+@serial
+def _scan(counts, starts):
+    """Turn the counts per chunk and tile into where each chunk writes its first entry."""
+    total = 0
+    for tile in range(counts.shape[1]):
+        starts[tile] = total
+        for chunk in range(counts.shape[0]):
+            count = counts[chunk, tile]
+            counts[chunk, tile] = total
+            total += count
+    starts[counts.shape[1]] = total
+    return total
+
+
+@parallel
+def _scatter(pairs, order_size, chunks, bounds, listed, heads, entries):
+    """Copy every chunk's pairs to their tiles."""
+    for chunk in prange(chunks):
+        for m in range(bounds[order_size * chunk // chunks], listed[chunk]):
+            code = pairs[m, 1]
+            tile = code >> 8
+            at = heads[chunk, tile]
+            heads[chunk, tile] = at + 1
+            entries[at, 0] = pairs[m, 0]
+            entries[at, 1] = ((code >> 4) & 15) | ((code & 15) << 8)
+            entries[at, 2] = m
+
+
+def bin_splats(
+    means2d: NDArray[np.float32],
+    conics: NDArray[np.float32],
+    depths: NDArray[np.float32],
+    opacities: NDArray[np.float32],
+    tiles: NDArray[np.int32],
+    width: int,
+    height: int,
+) -> Bins:
+    """Sort N projected splats (see ``projection.project``) into tiles."""
+    order = depth_order(depths, tiles)
+    n, chunks = len(order), threads()
+    tile_count = ((width + TILE - 1) // TILE) * ((height + TILE - 1) // TILE)
+    bounds = np.zeros(n + 1, np.int64)
+    np.cumsum(tiles[order], out=bounds[1:])
+    pairs = np.empty((max(int(bounds[-1]), 1), 2), np.int32)
+    slots = np.empty((n, 2), np.int64)
+    counts = np.empty((chunks, tile_count), np.int32)
+    listed = np.empty(chunks, np.int64)
+    starts = np.empty(tile_count + 1, np.int32)
+    _list_tiles(
+        order, means2d, conics, opacities, width, height, chunks, bounds, pairs, slots,
+        counts, listed,
+    )  # fmt: skip
+    total = _scan(counts, starts)
+    entries = np.empty((total, 3), np.int32)
+    _scatter(pairs, n, chunks, bounds, listed, counts, entries)
+    busiest = np.argsort(-np.diff(starts), kind="stable").astype(np.int32)
+    return Bins(entries, starts, busiest, order, slots, len(pairs))

@@ -1,0 +1,243 @@
+"""Blends binned splats front to back, 16 pixels of a tile row at a time, and back again (3DGS).
+
+A tile is 16 rows of one vector each, held in a small block that stays in the first-level cache. A
+splat touches only the rows its ellipse reaches. Every 16 splats the finished rows at the top and
+the bottom of the tile are dropped; a tile ends when all rows are finished.
+
+The backward pass walks front to back as well: it carries what is left of the pixel's colour, so
+that nothing per pixel and splat has to be stored.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import float32, prange
+
+from gsdmsr_cli.kernels import simd
+from gsdmsr_cli.kernels.jit import inline, parallel
+from gsdmsr_cli.splatting_constants import ALPHA_MAX, ALPHA_MIN, TILE, TRANSMITTANCE_STOP
+
+RECORD = 16
+"""Floats per splat record: one cache line, of which nine are used."""
+
+SLOT = 12
+"""Floats per gradient slot, of which nine are used."""
+
+_LOG2E = float32(math.log2(math.e))
+_ALPHA_MIN = float32(ALPHA_MIN)
+_ALPHA_MAX = float32(ALPHA_MAX)
+_STOP = float32(TRANSMITTANCE_STOP)
+_HALF = float32(0.5)
+_BLOCK = TILE * TILE
+
+
+@parallel
+def pack(splats, means2d, conics, opacities, colours, records):
+    """Write what blending needs of each splat to one cache line.
+
+    The exponent is in powers of two: alpha = 2^(r5 + r2 dx^2 + r3 dx dy + r4 dy^2).
+    """
+    for k in prange(splats.shape[0]):
+        i = splats[k]
+        records[i, 0], records[i, 1] = means2d[i, 0], means2d[i, 1]
+        records[i, 2] = -_HALF * _LOG2E * conics[i, 0]
+        records[i, 3] = -_LOG2E * conics[i, 1]
+        records[i, 4] = -_HALF * _LOG2E * conics[i, 2]
+        records[i, 5] = math.log2(opacities[i])
+        for channel in range(3):
+            records[i, 6 + channel] = colours[i, channel]
+
+
+@inline
+def _unfinished_rows(block, first, last):
+    """Shrink the range of tile rows while all pixels of its outer rows are finished."""
+    while first <= last and simd.reduce_max(simd.load(block, first * TILE)) < _STOP:
+        first += 1
+    while last >= first and simd.reduce_max(simd.load(block, last * TILE)) < _STOP:
+        last -= 1
+    return first, last
+
+
+@parallel
+def blend(records, entries, starts, busiest, lanes, columns, background, rgb, transmittance, ends):
+    """Draw every tile.
+
+    Args:
+        records: (N, 16) float32 from ``pack``.
+        entries, starts, busiest: see ``binning.Bins``.
+        lanes: how many threads take tiles in turns.
+        columns: tiles in a row.
+        background: (3,) float32.
+        rgb: (3, H', W') float32 out, H' and W' rounded up to whole tiles.
+        transmittance: (H', W') float32 out, what the splats let through.
+        ends: (tiles,) int32 out, the entry after the last one blended.
+    """
+    stride = rgb.shape[2]
+    plane = rgb.shape[1] * stride
+    pixels, through = rgb.reshape(-1), transmittance.reshape(-1)
+    for lane in prange(lanes):
+        block = np.empty(4 * _BLOCK, np.float32)
+        one, zero = simd.splat(float32(1)), simd.splat(float32(0))
+        cut, full, floor = simd.splat(_ALPHA_MIN), simd.splat(_ALPHA_MAX), simd.splat(float32(-126))
+        for turn in range(lane, busiest.shape[0], lanes):
+            tile = busiest[turn]
+            tile_y, tile_x = tile // columns, tile % columns
+            for y in range(TILE):
+                simd.store(block, y * TILE, one)
+                simd.store(block, _BLOCK + y * TILE, zero)
+                simd.store(block, 2 * _BLOCK + y * TILE, zero)
+                simd.store(block, 3 * _BLOCK + y * TILE, zero)
+            x0, y0 = float32(tile_x * TILE) + _HALF, float32(tile_y * TILE) + _HALF
+            start, end = starts[tile], starts[tile + 1]
+            top, bottom = 0, TILE - 1
+            k = start
+            while k < end:
+                if ((k - start) & 15) == 0 and k > start:
+                    top, bottom = _unfinished_rows(block, top, bottom)
+                    if top > bottom:
+                        break
+                i, rows = entries[k, 0], entries[k, 1]
+                k += 1
+                dx = simd.iota(x0 - records[i, 0])
+                at_row = dx * dx * records[i, 2] + simd.splat(records[i, 5])
+                slope, curve = dx * records[i, 3], records[i, 4]
+                red, green, blue = records[i, 6], records[i, 7], records[i, 8]
+                for y in range(max(rows & 255, top), min(rows >> 8, bottom) + 1):
+                    dy = y0 + float32(y) - records[i, 1]
+                    power = at_row + (slope + simd.splat(curve * dy)) * dy
+                    alpha = simd.minimum(simd.exp2(simd.maximum(power, floor)), full)
+                    alpha = simd.where_ge(alpha, cut, alpha)
+                    o = y * TILE
+                    before = simd.load(block, o)
+                    weight = alpha * before
+                    simd.store(block, o, before - weight)
+                    o += _BLOCK
+                    simd.store(block, o, simd.load(block, o) + weight * red)
+                    o += _BLOCK
+                    simd.store(block, o, simd.load(block, o) + weight * green)
+                    o += _BLOCK
+                    simd.store(block, o, simd.load(block, o) + weight * blue)
+            ends[tile] = k
+            for y in range(TILE):
+                o = (tile_y * TILE + y) * stride + tile_x * TILE
+                left = simd.load(block, y * TILE)
+                simd.store(through, o, left)
+                for channel in range(3):
+                    shade = simd.load(block, (1 + channel) * _BLOCK + y * TILE)
+                    simd.store(pixels, channel * plane + o, shade + left * background[channel])
+
+
+@parallel
+def blend_backward(
+    records, entries, starts, busiest, ends, lanes, columns, rgb, transmittance, d_rgb, d_alpha,
+    slots,
+):  # fmt: skip
+    """Write each entry's share of the gradients to its slot.
+
+    With e = alpha dL/dalpha of a pixel, a slot holds the sums over the tile of e, e dx, e dy,
+    e dx^2, e dx dy, e dy^2 and of weight times d_rgb. Saturated pixels have e = 0.
+
+    Args:
+        d_rgb: (3, H', W') float32. d_alpha: (H', W') float32. Both 0 outside the picture.
+        slots: (S, 12) float32 out; slots of entries that were not blended are set to 0.
+        others: see ``blend``.
+    """
+    stride = rgb.shape[2]
+    plane = rgb.shape[1] * stride
+    pixels, through = rgb.reshape(-1), transmittance.reshape(-1)
+    d_pixels, d_cover = d_rgb.reshape(-1), d_alpha.reshape(-1)
+    for lane in prange(lanes):
+        block = np.empty(5 * _BLOCK, np.float32)
+        one, zero = simd.splat(float32(1)), simd.splat(float32(0))
+        cut, full, floor = simd.splat(_ALPHA_MIN), simd.splat(_ALPHA_MAX), simd.splat(float32(-126))
+        for turn in range(lane, busiest.shape[0], lanes):
+            tile = busiest[turn]
+            tile_y, tile_x = tile // columns, tile % columns
+            start, end = starts[tile], ends[tile]
+            for k in range(end, starts[tile + 1]):
+                for j in range(9):
+                    slots[entries[k, 2], j] = float32(0)
+            for y in range(TILE):
+                o = (tile_y * TILE + y) * stride + tile_x * TILE
+                d_red, d_green = simd.load(d_pixels, o), simd.load(d_pixels, o + plane)
+                d_blue = simd.load(d_pixels, o + 2 * plane)
+                left = (
+                    d_red * simd.load(pixels, o)
+                    + d_green * simd.load(pixels, o + plane)
+                    + d_blue * simd.load(pixels, o + 2 * plane)
+                    - simd.load(d_cover, o) * simd.load(through, o)
+                )
+                simd.store(block, y * TILE, one)
+                simd.store(block, _BLOCK + y * TILE, left)
+                simd.store(block, 2 * _BLOCK + y * TILE, d_red)
+                simd.store(block, 3 * _BLOCK + y * TILE, d_green)
+                simd.store(block, 4 * _BLOCK + y * TILE, d_blue)
+            x0, y0 = float32(tile_x * TILE) + _HALF, float32(tile_y * TILE) + _HALF
+            top, bottom = 0, TILE - 1
+            for k in range(start, end):
+                if ((k - start) & 15) == 0 and k > start:
+                    top, bottom = _unfinished_rows(block, top, bottom)
+                i, rows, slot = entries[k, 0], entries[k, 1], entries[k, 2]
+                dx = simd.iota(x0 - records[i, 0])
+                at_row = dx * dx * records[i, 2] + simd.splat(records[i, 5])
+                slope, curve = dx * records[i, 3], records[i, 4]
+                red, green, blue = records[i, 6], records[i, 7], records[i, 8]
+                sum_e, sum_ey, sum_eyy = zero, zero, zero
+                sum_red, sum_green, sum_blue = zero, zero, zero
+                for y in range(max(rows & 255, top), min(rows >> 8, bottom) + 1):
+                    dy = y0 + float32(y) - records[i, 1]
+                    power = at_row + (slope + simd.splat(curve * dy)) * dy
+                    free = simd.exp2(simd.maximum(power, floor))
+                    alpha = simd.minimum(free, full)
+                    alpha = simd.where_ge(alpha, cut, alpha)
+                    o = y * TILE
+                    before, left = simd.load(block, o), simd.load(block, _BLOCK + o)
+                    d_red = simd.load(block, 2 * _BLOCK + o)
+                    d_green = simd.load(block, 3 * _BLOCK + o)
+                    d_blue = simd.load(block, 4 * _BLOCK + o)
+                    weight = alpha * before
+                    share = (d_red * red + d_green * green + d_blue * blue) * weight
+                    left = left - share
+                    simd.store(block, o, before - weight)
+                    simd.store(block, _BLOCK + o, left)
+                    e = simd.where_ge(full, free, share - alpha * left / (one - alpha))
+                    ey = e * dy
+                    sum_e, sum_ey, sum_eyy = sum_e + e, sum_ey + ey, sum_eyy + ey * dy
+                    sum_red, sum_green = sum_red + weight * d_red, sum_green + weight * d_green
+                    sum_blue = sum_blue + weight * d_blue
+                sum_ex = sum_e * dx
+                slots[slot, 0] = simd.reduce_sum(sum_e)
+                slots[slot, 1] = simd.reduce_sum(sum_ex)
+                slots[slot, 2] = simd.reduce_sum(sum_ey)
+                slots[slot, 3] = simd.reduce_sum(sum_ex * dx)
+                slots[slot, 4] = simd.reduce_sum(sum_ey * dx)
+                slots[slot, 5] = simd.reduce_sum(sum_eyy)
+                slots[slot, 6] = simd.reduce_sum(sum_red)
+                slots[slot, 7] = simd.reduce_sum(sum_green)
+                slots[slot, 8] = simd.reduce_sum(sum_blue)
+
+
+@parallel
+def gather(
+    splats, slot_ranges, slots, conics, opacities, d_means2d, d_conics, d_opacities, d_colours
+):
+    """Sum every splat's slots into the gradients of what was projected.
+
+    The ``d_`` arrays must be zero where a splat is not among ``splats``.
+    """
+    for k in prange(splats.shape[0]):
+        i = splats[k]
+        e, ex, ey = float32(0), float32(0), float32(0)
+        exx, exy, eyy = float32(0), float32(0), float32(0)
+        red, green, blue = float32(0), float32(0), float32(0)
+        for s in range(slot_ranges[k, 0], slot_ranges[k, 1]):
+            e, ex, ey = e + slots[s, 0], ex + slots[s, 1], ey + slots[s, 2]
+            exx, exy, eyy = exx + slots[s, 3], exy + slots[s, 4], eyy + slots[s, 5]
+            red, green, blue = red + slots[s, 6], green + slots[s, 7], blue + slots[s, 8]
+        a, b, c = conics[i, 0], conics[i, 1], conics[i, 2]
+        d_means2d[i, 0], d_means2d[i, 1] = a * ex + b * ey, b * ex + c * ey
+        d_conics[i, 0], d_conics[i, 1], d_conics[i, 2] = -_HALF * exx, -exy, -_HALF * eyy
+        d_opacities[i] = e / opacities[i]
+        d_colours[i, 0], d_colours[i, 1], d_colours[i, 2] = red, green, blue

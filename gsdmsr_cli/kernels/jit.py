@@ -1,0 +1,91 @@
+"""How every kernel is compiled: options, threads, and an on-disk cache that notices edits."""
+
+from __future__ import annotations
+
+import ctypes
+import hashlib
+import os
+import sys
+from pathlib import Path
+from typing import Any
+
+HERE = Path(__file__).parent
+
+
+def _sources_hash() -> str:
+    digest = hashlib.sha256()
+    for path in sorted(HERE.glob("*.py")):
+        digest.update(path.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+def _cache_folder() -> Path:
+    """Folder of compiled kernels: beside the sources if that is writable, else the user's cache.
+
+    Numba alone would not recompile a kernel when a helper in another module changes, so the
+    folder's name is a hash of all kernel sources.
+    """
+    beside = HERE / "__pycache__"
+    try:
+        beside.mkdir(exist_ok=True)
+        writable = os.access(beside, os.W_OK)
+    except OSError:
+        writable = False
+    if writable:
+        return beside / _sources_hash()
+    home = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache"))
+    return home / "gsdmsr" / _sources_hash()
+
+
+def _keep_large_blocks_in_the_heap() -> None:
+    """Stop glibc from returning large freed blocks to the system.
+
+    A fresh picture-sized buffer otherwise costs its page faults (about 1.4 GB/s) every step. Other
+    C libraries are left alone.
+    """
+    if not sys.platform.startswith("linux"):
+        return
+    mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
+    if mallopt is not None:
+        m_trim_threshold, m_mmap_max = -1, -4
+        mallopt(m_mmap_max, 0)
+        mallopt(m_trim_threshold, 2**31 - 1)
+
+
+os.environ.setdefault("NUMBA_CACHE_DIR", str(_cache_folder()))
+_keep_large_blocks_in_the_heap()
+
+import numba  # noqa: E402  (reads NUMBA_CACHE_DIR when imported)
+
+FLAGS = {"reassoc", "contract", "arcp", "nsz", "afn"}
+"""Floating-point liberties of all kernels. Not nnan and ninf: kernels test for non-finite input."""
+
+_OPTIONS: dict[str, Any] = {
+    "cache": True,
+    "fastmath": FLAGS,
+    "error_model": "numpy",
+    "boundscheck": False,
+    "nogil": True,
+}
+
+serial = numba.njit(**_OPTIONS)
+"""Compile a kernel that runs on one thread."""
+
+parallel = numba.njit(parallel=True, **_OPTIONS)
+"""Compile a kernel whose prange loops run on all threads."""
+
+inline = numba.njit(inline="always", **{k: v for k, v in _OPTIONS.items() if k != "cache"})
+"""Compile a helper into the kernels that call it."""
+
+
+def set_threads(count: int) -> int:
+    """Let kernels use ``count`` threads, or all cores if 0; return how many they use."""
+    most = int(numba.config.NUMBA_NUM_THREADS)
+    used = min(count, most) if count > 0 else most
+    numba.set_num_threads(used)
+    return used
+
+
+def threads() -> int:
+    """Return the number of threads kernels use."""
+    return int(numba.get_num_threads())

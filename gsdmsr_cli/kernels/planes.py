@@ -1,0 +1,270 @@
+"""Looks features up in a HexPlane level and scatters gradients back (Cao & Johnson 2023).
+
+A level holds three spatial planes (xy, xz, yz) and three temporal ones (x, y, z against time).
+Channels come in chunks of 16, one vector: space is (3, chunks, R, R, 16) with the plane's second
+axis first, time is (3, chunks, T, R, 16). All points of a frame share one time, so the temporal
+planes collapse to three lines once a frame. The feature is the product of the six bilinear or
+linear samples, positions clamped to the border.
+"""
+
+from __future__ import annotations
+
+from numba import float32, prange
+
+from gsdmsr_cli.kernels import simd
+from gsdmsr_cli.kernels.jit import inline, parallel
+
+_LANES = simd.LANES
+_BLOCKS = 64
+_HALF = float32(0.5)
+_ONE = float32(1)
+
+
+@inline
+def cell(x, size):
+    """Return the lower node and the weight of the upper one for x in [-1, 1] on ``size`` nodes."""
+    u = (x + _ONE) * _HALF * float32(size - 1)
+    u = min(max(u, float32(0)), float32(size - 1))
+    i = min(int(u), size - 2)
+    return i, u - float32(i)
+
+
+@parallel
+def collapse_time(planes, time, lines):
+    """Interpolate (3, chunks, T, R, 16) temporal planes at ``time`` in [-1, 1] to lines."""
+    chunks, size = planes.shape[1], planes.shape[2]
+    i, w = cell(float32(time), size)
+    for task in prange(3 * chunks):
+        axis, chunk = task // chunks, task % chunks
+        for r in range(planes.shape[3]):
+            for k in range(_LANES):
+                low, high = planes[axis, chunk, i, r, k], planes[axis, chunk, i + 1, r, k]
+                lines[axis, chunk, r, k] = low + (high - low) * w
+
+
+@parallel
+def spread_time(d_lines, time, d_planes):
+    """Write the gradient of the temporal planes: that of the lines at two times, else 0."""
+    chunks, size = d_planes.shape[1], d_planes.shape[2]
+    i, w = cell(float32(time), size)
+    for task in prange(3 * chunks):
+        axis, chunk = task // chunks, task % chunks
+        d_planes[axis, chunk, :i] = float32(0)
+        d_planes[axis, chunk, i + 2 :] = float32(0)
+        for r in range(d_planes.shape[3]):
+            for k in range(_LANES):
+                d = d_lines[axis, chunk, r, k]
+                d_planes[axis, chunk, i, r, k] = d * (_ONE - w)
+                d_planes[axis, chunk, i + 1, r, k] = d * w
+
+
+@inline
+def _corners(flat, at, row):
+    return (
+        simd.load(flat, at),
+        simd.load(flat, at + _LANES),
+        simd.load(flat, at + row),
+        simd.load(flat, at + row + _LANES),
+    )
+
+
+@inline
+def _bilinear(flat, at, row, wx, wy):
+    c00, c01, c10, c11 = _corners(flat, at, row)
+    low, high = c00 + (c01 - c00) * wx, c10 + (c11 - c10) * wx
+    return low + (high - low) * wy
+
+
+@inline
+def _linear(flat, at, w):
+    low = simd.load(flat, at)
+    return low + (simd.load(flat, at + _LANES) - low) * w
+
+
+@parallel
+def lookup(points, space, lines, features, offset):
+    """Write the features of (N, 3) points in [-1, 1]^3 to columns from ``offset`` on."""
+    n, size, chunks = points.shape[0], space.shape[2], space.shape[1]
+    planes, strips = space.reshape(-1), lines.reshape(-1)
+    out, width = features.reshape(-1), features.shape[1]
+    row, plane, strip = size * _LANES, size * size * _LANES, size * _LANES
+    for block in prange(_BLOCKS):
+        for i in range(n * block // _BLOCKS, n * (block + 1) // _BLOCKS):
+            ix, wx = cell(points[i, 0], size)
+            iy, wy = cell(points[i, 1], size)
+            iz, wz = cell(points[i, 2], size)
+            x_at, y_at, z_at = ix * _LANES, iy * _LANES, iz * _LANES
+            for c in range(chunks):
+                xy, xz, yz = c * plane, (chunks + c) * plane, (2 * chunks + c) * plane
+                x, y, z = c * strip, (chunks + c) * strip, (2 * chunks + c) * strip
+                value = _bilinear(planes, xy + iy * row + x_at, row, wx, wy)
+                value = value * _bilinear(planes, xz + iz * row + x_at, row, wx, wz)
+                value = value * _bilinear(planes, yz + iz * row + y_at, row, wy, wz)
+                value = value * _linear(strips, x + x_at, wx)
+                value = value * _linear(strips, y + y_at, wy)
+                value = value * _linear(strips, z + z_at, wz)
+                simd.store(out, i * width + offset + c * _LANES, value)
+
+
+@inline
+def _slopes(flat, at, row, wx, wy, d):
+    """Return the gradients in the two coordinates of a bilinear sample, in cells."""
+    c00, c01, c10, c11 = _corners(flat, at, row)
+    low, high = c01 - c00, c11 - c10
+    left, right = c10 - c00, c11 - c01
+    return d * (low + (high - low) * wy), d * (left + (right - left) * wx)
+
+
+@inline
+def _add(flat, at, value):
+    simd.store(flat, at, simd.load(flat, at) + value)
+
+
+@inline
+def _scatter_linear(flat, at, w, d):
+    upper = d * w
+    _add(flat, at, d - upper)
+    _add(flat, at + _LANES, upper)
+
+
+@inline
+def _scatter_bilinear(flat, at, row, wx, wy, d):
+    upper = d * wy
+    _scatter_linear(flat, at, wx, d - upper)
+    _scatter_linear(flat, at + row, wx, upper)
+
+
+@parallel
+def lookup_backward(points, space, lines, d_features, offset, d_space, d_lines, d_points):
+    """Write ``d_space`` and ``d_lines``; write the points' share of every chunk to ``d_points``.
+
+    Every thread owns whole chunks of 16 channels, so that threads never write to one place and
+    the sums do not depend on their number. Points outside [-1, 1] get no gradient along that axis.
+
+    Args:
+        d_points: (chunks, N, 3) out, to be summed over chunks, or (0, 0, 0) if not wanted.
+    """
+    n, size, chunks = points.shape[0], space.shape[2], space.shape[1]
+    planes, strips, d_out = space.reshape(-1), lines.reshape(-1), d_features.reshape(-1)
+    d_planes, d_strips = d_space.reshape(-1), d_lines.reshape(-1)
+    width = d_features.shape[1]
+    row, plane, strip = size * _LANES, size * size * _LANES, size * _LANES
+    cells = _HALF * float32(size - 1)
+    for c in prange(chunks):
+        for axis in range(3):
+            d_space[axis, c] = float32(0)
+            d_lines[axis, c] = float32(0)
+        for i in range(n):
+            ix, wx = cell(points[i, 0], size)
+            iy, wy = cell(points[i, 1], size)
+            iz, wz = cell(points[i, 2], size)
+            xy = c * plane + iy * row + ix * _LANES
+            xz = (chunks + c) * plane + iz * row + ix * _LANES
+            yz = (2 * chunks + c) * plane + iz * row + iy * _LANES
+            x = c * strip + ix * _LANES
+            y = (chunks + c) * strip + iy * _LANES
+            z = (2 * chunks + c) * strip + iz * _LANES
+            s_xy = _bilinear(planes, xy, row, wx, wy)
+            s_xz = _bilinear(planes, xz, row, wx, wz)
+            s_yz = _bilinear(planes, yz, row, wy, wz)
+            s_x, s_y, s_z = (
+                _linear(strips, x, wx),
+                _linear(strips, y, wy),
+                _linear(strips, z, wz),
+            )
+            d = simd.load(d_out, i * width + offset + c * _LANES)
+            d_time = d * (s_x * s_y * s_z)
+            d_xy, d_xz, d_yz = d_time * s_xz * s_yz, d_time * s_xy * s_yz, d_time * s_xy * s_xz
+            d = d * (s_xy * s_xz * s_yz)
+            d_x, d_y, d_z = d * s_y * s_z, d * s_x * s_z, d * s_x * s_y
+            if d_points.shape[0] > 0:
+                gx, gy = _slopes(planes, xy, row, wx, wy, d_xy)
+                hx, gz = _slopes(planes, xz, row, wx, wz, d_xz)
+                hy, hz = _slopes(planes, yz, row, wy, wz, d_yz)
+                gx = gx + hx + d_x * (simd.load(strips, x + _LANES) - simd.load(strips, x))
+                gy = gy + hy + d_y * (simd.load(strips, y + _LANES) - simd.load(strips, y))
+                gz = gz + hz + d_z * (simd.load(strips, z + _LANES) - simd.load(strips, z))
+                d_points[c, i, 0] = _inside(points[i, 0]) * cells * simd.reduce_sum(gx)
+                d_points[c, i, 1] = _inside(points[i, 1]) * cells * simd.reduce_sum(gy)
+                d_points[c, i, 2] = _inside(points[i, 2]) * cells * simd.reduce_sum(gz)
+            _scatter_bilinear(d_planes, xy, row, wx, wy, d_xy)
+            _scatter_bilinear(d_planes, xz, row, wx, wz, d_xz)
+            _scatter_bilinear(d_planes, yz, row, wy, wz, d_yz)
+            _scatter_linear(d_strips, x, wx, d_x)
+            _scatter_linear(d_strips, y, wy, d_y)
+            _scatter_linear(d_strips, z, wz, d_z)
+
+
+@inline
+def _inside(x):
+    return _ONE if -_ONE <= x <= _ONE else float32(0)
+
+
+@parallel
+def space_penalty(space, weight, d_space, sums):
+    """Write the gradient of weight * sum over planes of mean squared first differences.
+
+    ``sums`` (3 * chunks,) float64 gets the shares of the value. Total variation in both axes of a
+    plane, as in K-Planes (Fridovich-Keil et al. 2023, section 3.1).
+    """
+    chunks, size = space.shape[1], space.shape[2]
+    flat, d_flat = space.reshape(-1), d_space.reshape(-1)
+    row, plane = size * _LANES, size * size * _LANES
+    scale = float32(weight) / float32(chunks * _LANES * size * (size - 1))
+    for task in prange(3 * chunks):
+        at = task * plane
+        for k in range(plane):
+            d_flat[at + k] = float32(0)
+        total = simd.splat(float32(0))
+        for r in range(size):
+            for c in range(size):
+                o = at + r * row + c * _LANES
+                here = simd.load(flat, o)
+                if c + 1 < size:
+                    step = here - simd.load(flat, o + _LANES)
+                    total = total + step * step
+                    step = step * (float32(2) * scale)
+                    _add(d_flat, o, step)
+                    simd.store(d_flat, o + _LANES, simd.load(d_flat, o + _LANES) - step)
+                if r + 1 < size:
+                    step = here - simd.load(flat, o + row)
+                    total = total + step * step
+                    step = step * (float32(2) * scale)
+                    _add(d_flat, o, step)
+                    simd.store(d_flat, o + row, simd.load(d_flat, o + row) - step)
+        sums[task] = simd.reduce_sum(total) * scale
+
+
+@parallel
+def time_penalty(planes, smooth_weight, still_weight, d_planes, sums):
+    """Write the gradient of two penalties on temporal planes, each a sum over planes of means.
+
+    ``smooth_weight`` is that of squared second differences in time, ``still_weight`` that of
+    |1 - value| (HexPlane; 4D-GS, section 4.3). ``sums`` (3 * chunks,) float64 gets the value's
+    shares.
+    """
+    chunks, times, size = planes.shape[1], planes.shape[2], planes.shape[3]
+    flat, d_flat = planes.reshape(-1), d_planes.reshape(-1)
+    row, plane = size * _LANES, times * size * _LANES
+    smooth = float32(smooth_weight) / float32(chunks * _LANES * size * max(times - 2, 1))
+    still = float32(still_weight) / float32(chunks * _LANES * size * times)
+    for task in prange(3 * chunks):
+        at = task * plane
+        one, two = simd.splat(_ONE), float32(2)
+        up, down = simd.splat(still), simd.splat(-still)
+        total, distance = simd.splat(float32(0)), simd.splat(float32(0))
+        for o in range(at, at + plane, _LANES):
+            away = simd.load(flat, o) - one
+            distance = distance + simd.maximum(away, one - one - away)
+            sign = simd.where_positive(away, up) + simd.where_positive(one - one - away, down)
+            simd.store(d_flat, o, sign)
+        for t in range(1, times - 1):
+            for o in range(at + t * row, at + (t + 1) * row, _LANES):
+                bend = simd.load(flat, o - row) - simd.load(flat, o) * two
+                bend = bend + simd.load(flat, o + row)
+                total = total + bend * bend
+                bend = bend * (two * smooth)
+                _add(d_flat, o - row, bend)
+                _add(d_flat, o, bend * -two)
+                _add(d_flat, o + row, bend)
+        sums[task] = simd.reduce_sum(total) * smooth + simd.reduce_sum(distance) * still

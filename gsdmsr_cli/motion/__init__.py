@@ -1,0 +1,1 @@
+"""One file per motion: how splats move over time."""

@@ -1,0 +1,113 @@
+"""The pictures that training and evaluation compare with, decoded once and kept in memory."""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections import OrderedDict
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
+from itertools import accumulate
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gsdmsr_cli import imaging
+from gsdmsr_cli.camera import Camera
+from gsdmsr_cli.errors import DataError
+from gsdmsr_cli.scene import View
+
+_Key = tuple[Path, int, int]
+
+
+class Pictures:
+    """A lazy cache of pictures over one background at one scale; safe to use from any thread.
+
+    Compositing and shrinking are done in float and rounded once, to 8 bits (METHODS 0.11).
+
+    Args:
+        background: colour in [0, 1] behind straight alpha.
+        downscale: both sides are divided by this, 1 or more.
+        limit_bytes: memory for decoded pictures; beyond it the least recently used ones go.
+    """
+
+    def __init__(
+        self, background: tuple[float, float, float], downscale: int, limit_bytes: int
+    ) -> None:
+        if downscale < 1:
+            raise ValueError(f"downscale is {downscale}, not 1 or more")
+        self._background = background
+        self._downscale = downscale
+        self._limit = limit_bytes
+        self._held = 0
+        self._cache: OrderedDict[_Key, Tensor] = OrderedDict()
+        self._lock = threading.Lock()
+
+    def camera(self, view: View) -> Camera:
+        """Return the camera of the picture that ``load`` returns."""
+        return view.camera.resized(*self._size(view))
+
+    def load(self, view: View) -> Tensor:
+        """Return the view's picture, (3, h, w) uint8, contiguous; shared, so not to be changed.
+
+        Raises:
+            DataError: the file cannot be read or has another size than the view's camera.
+        """
+        key = (view.image_path, view.camera.width, view.camera.height)
+        with self._lock:
+            if key in self._cache:
+                self._cache.move_to_end(key)
+                return self._cache[key]
+        # Decoded outside the lock: two threads may decode the same picture, but none waits.
+        picture = self._decode(view)
+        with self._lock:
+            if key not in self._cache:
+                self._cache[key] = picture
+                self._held += picture.numel()
+            self._cache.move_to_end(key)
+            while self._held > self._limit:
+                self._held -= self._cache.popitem(last=False)[1].numel()
+        return picture
+
+    def preload(
+        self, views: Iterable[View], progress: Callable[[int, int], None] | None = None
+    ) -> None:
+        """Decode the views in order, on a few threads, as far as the memory limit goes.
+
+        Args:
+            views: the pictures wanted first.
+            progress: called with (done, total) after each picture.
+
+        Raises:
+            DataError: as ``load``.
+        """
+        views = list(views)
+        ends = accumulate(3 * width * height for width, height in map(self._size, views))
+        views = views[: sum(end <= self._limit for end in ends)]
+        with ThreadPoolExecutor(min(8, os.cpu_count() or 1)) as pool:
+            for done, _ in enumerate(pool.map(self.load, views), start=1):
+                if progress is not None:
+                    progress(done, len(views))
+
+    def _size(self, view: View) -> tuple[int, int]:
+        width, height = view.camera.width, view.camera.height
+        return (
+            max(1, round(width / self._downscale)),
+            max(1, round(height / self._downscale)),
+        )
+
+    def _decode(self, view: View) -> Tensor:
+        image = imaging.read_image(view.image_path)
+        height, width, _ = image.shape
+        if (width, height) != (view.camera.width, view.camera.height):
+            raise DataError(
+                f"image {view.image_path} is {width} x {height} px, but its camera is "
+                f"{view.camera.width} x {view.camera.height}; they must agree"
+            )
+        pixels = imaging.composite(image, self._background)
+        if self._downscale > 1:
+            pixels = imaging.resize_area(pixels, *self._size(view))
+        planes = np.rint(pixels * 255).clip(0, 255).astype(np.uint8).transpose(2, 0, 1)
+        return torch.from_numpy(np.ascontiguousarray(planes))

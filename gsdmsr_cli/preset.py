@@ -1,0 +1,246 @@
+"""Every option of a training run, as frozen dataclasses per topic, and how a preset is loaded.
+
+Schedules are functions of progress in [0, 1]: step / steps or, with a budget, elapsed / budget.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from typing import Any, Literal
+
+from gsdmsr_cli import preset_files, strict
+from gsdmsr_cli.errors import UsageError
+from gsdmsr_cli.strict import require
+
+_SECONDS = {"s": 1.0, "m": 60.0, "h": 3600.0}
+_DURATION = "a positive duration such as 90s, 8m or 1.5h"
+_PROGRESS = "a progress from 0 to 1"
+
+
+def _duration(text: str) -> float | None:
+    match = re.fullmatch(r"(\d+(?:\.\d+)?)([smh])", text)
+    seconds = float(match[1]) * _SECONDS[match[2]] if match else 0.0
+    return seconds if 0.0 < seconds < math.inf else None
+
+
+def parse_duration(text: str) -> float:
+    """Return the seconds of "90s", "8m", "2.5m" or "1h".
+
+    Raises:
+        UsageError: the text is not a positive duration.
+    """
+    seconds = _duration(text)
+    if seconds is None:
+        raise UsageError(f"'{text}' is not a duration; allowed: {_DURATION}")
+    return seconds
+
+
+def _require_progress(options: object, *keys: str) -> None:
+    for key in keys:
+        require(options, key, 0.0 <= getattr(options, key) <= 1.0, _PROGRESS)
+
+
+def _require_at_least(options: object, least: int, *keys: str) -> None:
+    for key in keys:
+        require(options, key, getattr(options, key) >= least, f"{least} or more")
+
+
+def _require_positive(options: object, *keys: str) -> None:
+    for key in keys:
+        require(options, key, getattr(options, key) > 0, "a number above 0")
+
+
+@dataclass(frozen=True)
+class DataOptions:
+    """How pictures are read.
+
+    Attributes:
+        background: colour behind transparent pixels, in training and evaluation.
+        downscale: both sides of every picture are divided by this whole number, by area.
+        cache_mib: limit of the decoded pictures kept in memory [MiB].
+    """
+
+    background: Literal["white", "black"] = "white"
+    downscale: int = 1
+    cache_mib: int = 4096
+
+    def __post_init__(self) -> None:
+        _require_at_least(self, 1, "downscale")
+        _require_at_least(self, 0, "cache_mib")
+
+
+@dataclass(frozen=True)
+class SplatOptions:
+    """The splats to start from.
+
+    Attributes:
+        count: number of random splats where the scene brings no points.
+        opacity: their opacity, between 0 and 1.
+        sh_degree: highest degree of the spherical harmonics, 0 to 3.
+        sh_start: progress at which degree 1 joins; higher degrees follow.
+    """
+
+    count: int = 10000
+    opacity: float = 0.1
+    sh_degree: int = 1
+    sh_start: float = 0.3
+
+    def __post_init__(self) -> None:
+        _require_at_least(self, 1, "count")
+        require(self, "opacity", 0.0 < self.opacity < 1.0, "a number between 0 and 1, neither")
+        require(self, "sh_degree", 0 <= self.sh_degree <= 3, "0 to 3")
+        _require_progress(self, "sh_start")
+
+
+@dataclass(frozen=True)
+class TrainingOptions:
+    """How long to train, and in which phases.
+
+    Attributes:
+        steps: length of the training [steps], unless there is a budget.
+        budget: length of the training as wall time, such as "8m"; null counts steps.
+        static_until: progress up to which nothing moves.
+        coarse_until: progress up to which only the coarse part of the motion learns.
+        views_per_step: pictures drawn and compared per step.
+        low_resolution_until: progress up to which pictures of half the size are drawn; 0 is never.
+        checkpoint_minutes: time between checkpoints [min].
+        seed: seed of every random choice.
+        threads: number of CPU threads; 0 takes all cores.
+    """
+
+    steps: int = 10000
+    budget: str | None = None
+    static_until: float = 0.08
+    coarse_until: float = 0.12
+    views_per_step: int = 1
+    low_resolution_until: float = 0.0
+    checkpoint_minutes: float = 2.0
+    seed: int = 0
+    threads: int = 0
+
+    def __post_init__(self) -> None:
+        _require_at_least(self, 1, "steps", "views_per_step")
+        known = self.budget is None or _duration(self.budget) is not None
+        require(self, "budget", known, f"null or {_DURATION}")
+        _require_progress(self, "static_until", "coarse_until", "low_resolution_until")
+        least = f"training.static_until ({self.static_until:g}) or more"
+        require(self, "coarse_until", self.coarse_until >= self.static_until, least)
+        _require_positive(self, "checkpoint_minutes")
+        require(self, "seed", 0 <= self.seed < 2**32, "0 to 4294967295")
+        _require_at_least(self, 0, "threads")
+
+
+@dataclass(frozen=True)
+class LossOptions:
+    """How a drawn picture is compared with the true one.
+
+    Attributes:
+        ssim: weight w of (1 - w) L1 + w (1 - SSIM), 0 to 1.
+    """
+
+    ssim: float = 0.0
+
+    def __post_init__(self) -> None:
+        require(self, "ssim", 0.0 <= self.ssim <= 1.0, "a weight from 0 to 1")
+
+
+@dataclass(frozen=True)
+class OptimizerOptions:
+    """Learning rates of Adam as (start, end), log-linear in progress.
+
+    Attributes:
+        means: of the centres, in units of the scene's radius.
+        log_scales: of the logarithms of the scales.
+        quats: of the rotations.
+        logit_opacities: of the logits of the opacities.
+        sh: of the constant colour coefficient.
+        planes: of the motion's plane grids.
+        network: of the motion's networks.
+    """
+
+    means: tuple[float, float] = (7e-4, 7e-6)
+    log_scales: tuple[float, float] = (5e-3, 1e-3)
+    quats: tuple[float, float] = (1e-3, 2e-4)
+    logit_opacities: tuple[float, float] = (0.05, 0.01)
+    sh: tuple[float, float] = (2.5e-3, 5e-4)
+    planes: tuple[float, float] = (8e-3, 1e-4)
+    network: tuple[float, float] = (8e-4, 2e-5)
+
+    def __post_init__(self) -> None:
+        for rate in fields(self):
+            ok = min(getattr(self, rate.name)) > 0
+            require(self, rate.name, ok, "[start, end], both above 0")
+
+
+@dataclass(frozen=True)
+class DensityOptions:
+    """When and where splats are cloned, split, pruned and reset (3DGS, Kerbl et al. 2023).
+
+    Attributes:
+        every: interval of growing and pruning [steps].
+        start: first step at which it happens [steps].
+        until: progress at which it ends.
+        gradient: mean norm of the screen-space gradient above which a splat grows [1 / NDC unit].
+        split_scale: a growing splat is split above this scale and cloned below [scene radii].
+        prune_scale: a splat above this scale is pruned [scene radii].
+        prune_opacity: a splat below this opacity is pruned.
+        reset_at: progress of each opacity reset.
+        cap: most splats there may be.
+    """
+
+    every: int = 100
+    start: int = 300
+    until: float = 0.55
+    gradient: float = 2e-4
+    split_scale: float = 0.01
+    prune_scale: float = 0.1
+    prune_opacity: float = 0.005
+    reset_at: tuple[float, ...] = (0.12,)
+    cap: int = 100000
+
+    def __post_init__(self) -> None:
+        _require_at_least(self, 1, "every", "cap")
+        _require_at_least(self, 0, "start")
+        _require_progress(self, "until")
+        _require_positive(self, "gradient", "split_scale", "prune_scale")
+        require(self, "prune_opacity", 0.0 <= self.prune_opacity < 1.0, "0 or more, below 1")
+        ok = all(0.0 <= progress <= 1.0 for progress in self.reset_at)
+        require(self, "reset_at", ok, f"a list, each item {_PROGRESS}")
+
+
+@dataclass(frozen=True)
+class Preset:
+    """All options of one training run.
+
+    Attributes:
+        motion: "name" of the motion and the options that its own file declares.
+    """
+
+    data: DataOptions = field(default_factory=DataOptions)
+    splats: SplatOptions = field(default_factory=SplatOptions)
+    training: TrainingOptions = field(default_factory=TrainingOptions)
+    losses: LossOptions = field(default_factory=LossOptions)
+    optimizer: OptimizerOptions = field(default_factory=OptimizerOptions)
+    density: DensityOptions = field(default_factory=DensityOptions)
+    motion: dict[str, Any] = field(default_factory=lambda: {"name": "multiscale"})
+
+    def __post_init__(self) -> None:
+        named = isinstance(self.motion.get("name"), str)
+        require(self, "motion", named, "a mapping with the name of a motion")
+
+
+def load_preset(name: str | None, config: Path | None, overrides: Sequence[str]) -> Preset:
+    """Load preset ``name``, overridden by the YAML file ``config``, then by ``a.b=value`` texts.
+
+    ``motion`` stays a ``strict.Located``: the motion's own options are checked where it starts.
+
+    Raises:
+        UsageError: a preset or key is unknown, or a value has the wrong type or range; the message
+            names the file and line, or the override.
+    """
+    mapping = preset_files.resolve(name, config, overrides)
+    return strict.build(Preset, mapping, str(config or name or "default"))

@@ -1,0 +1,76 @@
+"""Engines: each draws splats under a camera and is differentiable.
+
+An engine is a module of this package with two functions::
+
+    def unavailable(device: str) -> str | None
+        # None if the engine can draw tensors on the device, else the reason, one clause
+
+    def rasterize(splats: Splats, camera: Camera, background: Tensor,
+                  sh_degree: int | None = None, with_depth: bool = False) -> Frame
+        # background is (3,); colours use the first (sh_degree + 1)^2 coefficients, all by default
+
+Gradients reach all five tensors of the splats; ``frame.means2d`` is part of the graph, so that
+``frame.means2d.retain_grad()`` gives density control its statistic. Every engine is held to
+``reference`` by tests/raster/test_conformance.py.
+"""
+
+from __future__ import annotations
+
+from typing import Protocol, cast
+
+from torch import Tensor
+
+from gsdmsr_cli import plugins
+from gsdmsr_cli.camera import Camera
+from gsdmsr_cli.errors import UsageError
+from gsdmsr_cli.frame import Frame
+from gsdmsr_cli.splats import Splats
+
+FASTEST_FIRST = ("cuda", "cpu", "reference")
+
+
+class Engine(Protocol):
+    """What a module of this package offers."""
+
+    def unavailable(self, device: str) -> str | None:
+        """Return why the engine cannot draw on ``device``, or None if it can."""
+
+    def rasterize(
+        self,
+        splats: Splats,
+        camera: Camera,
+        background: Tensor,
+        sh_degree: int | None = None,
+        with_depth: bool = False,
+    ) -> Frame:
+        """Draw the splats."""
+
+
+def load_engine(name: str) -> Engine:
+    """Import the engine ``name``.
+
+    Raises:
+        UsageError: there is no such engine.
+    """
+    return cast(Engine, plugins.load(__name__, name))
+
+
+def engine_names() -> list[str]:
+    """Return the names of all engines, the fastest first."""
+    return [name for name in FASTEST_FIRST if name in plugins.names(__name__)]
+
+
+def best_engine(device: str) -> Engine:
+    """Return the fastest engine that can draw on ``device`` ("cpu" or "cuda").
+
+    Raises:
+        UsageError: none can; the message lists every engine's reason.
+    """
+    reasons = []
+    for name in engine_names():
+        engine = load_engine(name)
+        reason = engine.unavailable(device)
+        if reason is None:
+            return engine
+        reasons.append(f"{name}: {reason}")
+    raise UsageError(f"no engine can draw on device '{device}' ({'; '.join(reasons)})")

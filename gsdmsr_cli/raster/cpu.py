@@ -1,0 +1,192 @@
+"""The CPU engine: Numba kernels behind one autograd function per stage, project and blend."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.autograd import Function
+from torch.autograd.function import once_differentiable
+
+from gsdmsr_cli.camera import Camera
+from gsdmsr_cli.frame import Frame
+from gsdmsr_cli.kernels import binning, blending, harmonics, projection
+from gsdmsr_cli.kernels.jit import threads
+from gsdmsr_cli.splats import Splats
+from gsdmsr_cli.splatting_constants import TILE
+from gsdmsr_cli.tensors import array
+
+
+def unavailable(device: str) -> str | None:
+    """Return why the engine cannot draw on ``device``, or None if it can."""
+    return None if device == "cpu" else "it draws tensors that lie in the memory of the CPU"
+
+
+def rasterize(
+    splats: Splats,
+    camera: Camera,
+    background: Tensor,
+    sh_degree: int | None = None,
+    with_depth: bool = False,
+) -> Frame:
+    """Draw float32 splats; see ``gsdmsr_cli.raster``."""
+    degree = splats.sh_degree if sh_degree is None else min(sh_degree, splats.sh_degree)
+    tensors = [tensor.contiguous() for tensor in splats.tensors().values()]
+    means2d, conics, depths, opacities, colours, radii, tiles = _Project.apply(
+        camera, degree, *tensors
+    )
+    bins = binning.bin_splats(
+        *(array(t) for t in (means2d, conics, depths, opacities, tiles)),
+        camera.width,
+        camera.height,
+    )
+    screen = means2d, conics, opacities
+    size = camera.width, camera.height
+    rgb, alpha = _Blend.apply(bins, size, *screen, colours, background)
+    depth = None
+    if with_depth:
+        as_colour = depths[:, None].expand(-1, 3)
+        depth = _Blend.apply(bins, size, *screen, as_colour, torch.zeros(3))[0][..., 0]
+    return Frame(rgb=rgb, alpha=alpha, depth=depth, radii=radii, means2d=means2d)
+
+
+def _view(camera: Camera) -> tuple[NDArray[np.float32], NDArray[np.float32], int, int]:
+    intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy], np.float32)
+    return camera.world_to_camera[:3].astype(np.float32), intrinsics, camera.width, camera.height
+
+
+class _Project(Function):
+    """Stored splats to screen positions, conics, depths, opacities and colours."""
+
+    @staticmethod
+    def forward(
+        ctx: Any,
+        camera: Camera,
+        degree: int,
+        means: Tensor,
+        quats: Tensor,
+        log_scales: Tensor,
+        logit_opacities: Tensor,
+        sh: Tensor,
+    ) -> tuple[Tensor, ...]:
+        n = len(means)
+        means2d, conics, colours = (torch.empty(n, k) for k in (2, 3, 3))
+        depths, opacities, radii = (torch.empty(n) for _ in range(3))
+        tiles = torch.empty(n, dtype=torch.int32)
+        stored = [array(t) for t in (means, quats, log_scales, logit_opacities, sh)]
+        projected = [array(t) for t in (means2d, conics, depths, opacities, radii, tiles)]
+        projection.project(*stored, *_view(camera), *projected)
+        count, centre = (degree + 1) ** 2, camera.centre.astype(np.float32)
+        harmonics.colour(stored[0], stored[4], count, centre, array(opacities), array(colours))
+        ctx.camera, ctx.count, ctx.centre = camera, count, centre
+        ctx.save_for_backward(
+            means, quats, log_scales, logit_opacities, sh, conics, opacities, colours
+        )
+        ctx.mark_non_differentiable(radii, tiles)
+        ctx.set_materialize_grads(True)
+        return means2d, conics, depths, opacities, colours, radii, tiles
+
+    @staticmethod
+    @once_differentiable  # type: ignore[untyped-decorator]
+    def backward(
+        ctx: Any,
+        d_means2d: Tensor,
+        d_conics: Tensor,
+        d_depths: Tensor,
+        d_opacities: Tensor,
+        d_colours: Tensor,
+        *_: Any,
+    ) -> tuple[Tensor | None, ...]:
+        saved = ctx.saved_tensors
+        means, quats, log_scales, _, sh, conics, opacities, colours = map(array, saved)
+        gradients = [torch.empty_like(tensor) for tensor in saved[:5]]
+        d_means, d_quats, d_log_scales, d_logit_opacities, d_sh = map(array, gradients)
+        incoming = [
+            array(d.contiguous()) for d in (d_means2d, d_conics, d_depths, d_opacities, d_colours)
+        ]
+        projection.project_backward(
+            means, quats, log_scales, *_view(ctx.camera), conics, opacities, *incoming[:4],
+            d_means, d_quats, d_log_scales, d_logit_opacities,
+        )  # fmt: skip
+        harmonics.colour_backward(
+            means, sh, ctx.count, ctx.centre, opacities, colours, incoming[4], d_means, d_sh
+        )
+        return None, None, *gradients
+
+
+class _Blend(Function):
+    """Binned splats to a picture; gradients for all but the bins and the background."""
+
+    @staticmethod
+    def forward(
+        ctx: Any,
+        bins: binning.Bins,
+        size: tuple[int, int],
+        means2d: Tensor,
+        conics: Tensor,
+        opacities: Tensor,
+        colours: Tensor,
+        background: Tensor,
+    ) -> tuple[Tensor, Tensor]:
+        width, height = size
+        columns, rows = -(-width // TILE), -(-height // TILE)
+        records = np.empty((len(means2d), blending.RECORD), np.float32)
+        screen = [array(t) for t in (means2d, conics, opacities)]
+        blending.pack(bins.splats, *screen, array(colours.contiguous()), records)
+        rgb = torch.empty(3, rows * TILE, columns * TILE)
+        transmittance = torch.empty(rows * TILE, columns * TILE)
+        ends = np.empty(rows * columns, np.int32)
+        blending.blend(
+            records, bins.entries, bins.starts, bins.busiest, threads(), columns,
+            array(background.contiguous()), array(rgb), array(transmittance), ends,
+        )  # fmt: skip
+        ctx.bins, ctx.records, ctx.ends, ctx.columns = bins, records, ends, columns
+        ctx.padded = rgb, transmittance
+        ctx.save_for_backward(conics, opacities)
+        ctx.set_materialize_grads(False)
+        return cropped(rgb, height, width), 1.0 - transmittance[:height, :width]
+
+    @staticmethod
+    @once_differentiable  # type: ignore[untyped-decorator]
+    def backward(ctx: Any, d_rgb: Tensor | None, d_alpha: Tensor | None) -> tuple[Any, ...]:
+        conics, opacities = ctx.saved_tensors
+        bins, (rgb, transmittance) = ctx.bins, ctx.padded
+        n = len(conics)
+        slots = np.empty((bins.slot_count, blending.SLOT), np.float32)
+        blending.blend_backward(
+            ctx.records, bins.entries, bins.starts, bins.busiest, ctx.ends, threads(), ctx.columns,
+            array(rgb), array(transmittance),
+            array(padded(d_rgb, rgb.shape)),
+            array(padded(None if d_alpha is None else d_alpha[..., None], (1, *rgb.shape[1:]))[0]),
+            slots,
+        )  # fmt: skip
+        d_means2d, d_conics, d_colours = (torch.zeros(n, k) for k in (2, 3, 3))
+        d_opacities = torch.zeros(n)
+        blending.gather(
+            bins.splats, bins.slots, slots, array(conics), array(opacities),
+            array(d_means2d), array(d_conics), array(d_opacities), array(d_colours),
+        )  # fmt: skip
+        return None, None, d_means2d, d_conics, d_opacities, d_colours, None
+
+
+def cropped(planes: Tensor, height: int, width: int) -> Tensor:
+    """Return planes (C, H', W') as a picture (H, W, C), a view of the same memory."""
+    return planes[:, :height, :width].permute(1, 2, 0)
+
+
+def padded(picture: Tensor | None, shape: tuple[int, ...]) -> Tensor:
+    """Return a picture (H, W, C) as planes (C, H', W'), 0 outside, without a copy where possible.
+
+    A picture that is itself a full view of such planes (see ``cropped``) is returned as they are.
+    """
+    if picture is None:
+        return torch.zeros(shape)
+    planes = picture.permute(2, 0, 1)
+    if tuple(planes.shape) == tuple(shape):
+        return planes.contiguous()
+    result = torch.zeros(shape)
+    result[:, : planes.shape[1], : planes.shape[2]] = planes
+    return result

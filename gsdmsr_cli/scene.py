@@ -1,0 +1,88 @@
+"""A captured scene: views with cameras and times, and the points to start from."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gsdmsr_cli.camera import Camera
+from gsdmsr_cli.errors import DataError
+
+SPLITS = ("train", "val", "test")
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """One picture of the scene; its image file is decoded only when asked for.
+
+    Attributes:
+        name: unique name within its split, for reports.
+        camera: camera at the full resolution of the file.
+        time: moment in [0, 1].
+        split: "train", "val" or "test".
+        image_path: the picture, RGB or RGBA with straight alpha, or grey.
+        mask_path: optional picture, white where pixels count.
+    """
+
+    name: str
+    camera: Camera
+    time: float
+    split: str
+    image_path: Path
+    mask_path: Path | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """All views of one capture.
+
+    Attributes:
+        root: the folder it was read from.
+        layout: name of the format it was read with.
+        views: every view of every split, in file order.
+        points: (P, 3) float32 initial points [world units]; P may be 0.
+        colours: (P, 3) float32 colours of the points in [0, 1].
+        duration: length of the capture [s], or None where the format does not say.
+        bound: half edge of the box around the world's origin that holds what is to be
+            reconstructed [world units], from the format's convention or the points.
+        fingerprint: hash of the layout files, to tell two data sets apart.
+    """
+
+    root: Path
+    layout: str
+    views: tuple[View, ...]
+    points: NDArray[np.float32]
+    colours: NDArray[np.float32]
+    duration: float | None
+    bound: float
+    fingerprint: str
+
+    def split(self, name: str) -> tuple[View, ...]:
+        """Return the views of one split.
+
+        Raises:
+            DataError: the split has no views.
+        """
+        views = tuple(view for view in self.views if view.split == name)
+        if not views:
+            counts = {split: sum(v.split == split for v in self.views) for split in SPLITS}
+            found = ", ".join(f"{split} {count}" for split, count in counts.items() if count)
+            raise DataError(
+                f"{self.root}: split '{name}' has no frames; found {found or 'none at all'}"
+            )
+        return views
+
+    @property
+    def radius(self) -> float:
+        """Extent of the train cameras: 1.1 times the largest distance to their mean (3DGS)."""
+        centres = np.stack([view.camera.centre for view in self.split("train")])
+        spread = np.linalg.norm(centres - centres.mean(0), axis=1).max()
+        return float(1.1 * spread) if spread > 1e-6 else 1.0
+
+    @property
+    def train_times(self) -> list[float]:
+        """Distinct times of the train views, ascending."""
+        return sorted({view.time for view in self.split("train")})

@@ -1,0 +1,25 @@
+"""The constants of splatting, one place for every engine (values as in 3DGS, Kerbl et al. 2023, except where said)."""
+
+from __future__ import annotations
+
+NEAR = 0.2
+"""Splats whose centre has camera z at or below this [world units] are not drawn (3DGS)."""
+
+DILATION = 0.3
+"""Variance added to both axes of a splat's screen covariance [px^2], a low-pass (3DGS)."""
+
+ALPHA_MIN = 1.0 / 255.0
+"""A splat does not touch a pixel where its alpha falls below this (3DGS)."""
+
+ALPHA_MAX = 0.999
+"""Alpha saturates here; a saturated pixel passes no gradient to the splat's shape and opacity."""
+
+TRANSMITTANCE_STOP = 1e-4
+"""A pixel is finished AFTER its transmittance falls below this. Engines may go on blending it as
+long as others of the same tile are unfinished; the difference is below this value."""
+
+FRUSTUM_MARGIN = 1.3
+"""x/z and y/z are clamped to this multiple of the half image in the projection's Jacobian (3DGS)."""
+
+TILE = 16
+"""Edge of a tile [px] in engines that have tiles."""

@@ -1,0 +1,273 @@
+"""PLY export: bytes by an independent parse, round trips, sequences and refusals."""
+
+from __future__ import annotations
+
+import errno
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import HealthCheck, example, given, settings
+from hypothesis import strategies as st
+
+from gsdmsr_cli import plugins
+from gsdmsr_cli.errors import DataError, UsageError
+from gsdmsr_cli.exports import ExportOptions
+from gsdmsr_cli.exports import ply as ply_format
+from gsdmsr_cli.exports import ply_sequence as sequence_format
+from gsdmsr_cli.exports._ply import read_ply, write_ply
+from gsdmsr_cli.splats import Splats
+
+
+def make_splats(n: int, degree: int, seed: int = 0) -> Splats:
+    """Return random splats whose quaternions are not normalised."""
+    generator = torch.Generator().manual_seed(seed)
+    shapes = {"means": (3,), "quats": (4,), "log_scales": (3,), "logit_opacities": ()}
+    shapes["sh"] = ((degree + 1) ** 2, 3)
+    return Splats(**{k: 3 * torch.randn((n, *s), generator=generator) for k, s in shapes.items()})
+
+
+class Falling:
+    """Splats that fall by one unit."""
+
+    def __init__(self, splats: Splats) -> None:
+        self.splats = splats
+
+    def at(self, time: float) -> Splats:
+        return replace(self.splats, means=self.splats.means + torch.tensor([0.0, time, 0.0]))
+
+
+def parse(path: Path) -> tuple[list[str], np.ndarray]:
+    """Return header lines and the table of float32, knowing only what a PLY is."""
+    header, _, body = path.read_bytes().partition(b"end_header\n")
+    lines = header.decode().splitlines()
+    columns = sum(line.startswith("property float ") for line in lines)
+    return lines, np.frombuffer(body, "<f4").reshape(-1, columns)
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_header_and_columns_are_those_of_3dgs(tmp_path: Path, degree: int) -> None:
+    splats = make_splats(7, degree)
+    write_ply(tmp_path / "a.ply", splats)
+    lines, table = parse(tmp_path / "a.ply")
+    rest = 3 * ((degree + 1) ** 2 - 1)
+    names = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
+    names += [f"f_rest_{i}" for i in range(rest)]
+    names += ["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
+    assert lines[:3] == ["ply", "format binary_little_endian 1.0", "element vertex 7"]
+    assert lines[3:] == [f"property float {name}" for name in names]
+    column = {name: table[:, i] for i, name in enumerate(names)}
+    for axis, letter in enumerate("xyz"):
+        assert np.array_equal(column[letter], splats.means[:, axis].numpy())
+        assert not column[f"n{letter}"].any()
+        assert np.array_equal(column[f"scale_{axis}"], splats.log_scales[:, axis].numpy())
+    for channel in range(3):
+        assert np.array_equal(column[f"f_dc_{channel}"], splats.sh[:, 0, channel].numpy())
+        for k in range(1, (degree + 1) ** 2):
+            stored = column[f"f_rest_{channel * (rest // 3) + k - 1}"]
+            assert np.array_equal(stored, splats.sh[:, k, channel].numpy())
+    assert np.array_equal(column["opacity"], splats.logit_opacities.numpy())
+    quats = np.stack([column[f"rot_{i}"] for i in range(4)], axis=1)
+    expected = splats.quats.numpy() / np.linalg.norm(splats.quats.numpy(), axis=1, keepdims=True)
+    np.testing.assert_allclose(quats, expected, atol=1e-6)
+    np.testing.assert_allclose(np.linalg.norm(quats, axis=1), 1.0, atol=1e-6)
+
+
+@settings(max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(n=st.integers(0, 40), degree=st.integers(0, 3), seed=st.integers(0, 2**31))
+@example(n=0, degree=0, seed=0)
+@example(n=0, degree=3, seed=0)
+def test_round_trip_is_exact(tmp_path: Path, n: int, degree: int, seed: int) -> None:
+    splats = make_splats(n, degree, seed)
+    write_ply(tmp_path / "a.ply", splats)
+    back = read_ply(tmp_path / "a.ply")
+    assert (len(back), back.sh_degree) == (n, degree)
+    for name in ("means", "log_scales", "logit_opacities", "sh"):
+        assert torch.equal(getattr(back, name), getattr(splats, name)), name
+    unit = torch.nn.functional.normalize(splats.quats.double(), dim=1).float()
+    assert torch.equal(back.quats, unit)
+    assert all(tensor.dtype == torch.float32 for tensor in back.tensors().values())
+
+
+def test_zero_quaternion_is_written_as_the_identity(tmp_path: Path) -> None:
+    splats = make_splats(3, 0)
+    splats.quats[1] = 0.0
+    write_ply(tmp_path / "a.ply", splats)
+    assert read_ply(tmp_path / "a.ply").quats[1].tolist() == [1.0, 0.0, 0.0, 0.0]
+
+
+@pytest.mark.parametrize(
+    ("name", "poison"),
+    [
+        (name, poison)
+        for name in ("means", "quats", "log_scales", "logit_opacities", "sh")
+        for poison in (float("nan"), float("inf"), 1e39)
+        if (name, poison) != ("quats", 1e39)  # a huge quaternion has a direction all the same
+    ],
+)
+def test_broken_rows_are_counted_and_nothing_is_written(
+    tmp_path: Path, name: str, poison: float
+) -> None:
+    splats = make_splats(9, 1).map(torch.Tensor.double)  # 1e39 overflows only as float32
+    getattr(splats, name)[[2, 5]] = poison
+    with pytest.raises(DataError, match="2 of 9 splats"):
+        write_ply(tmp_path / "a.ply", splats)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_splats_that_require_gradients_are_written(tmp_path: Path) -> None:
+    splats = make_splats(2, 0).map(lambda tensor: tensor.requires_grad_())
+    write_ply(tmp_path / "a.ply", splats)
+    assert len(read_ply(tmp_path / "a.ply")) == 2
+
+
+def test_full_disk_keeps_the_old_file_and_leaves_no_part(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "a.ply"
+    write_ply(path, make_splats(4, 0))
+    old = path.read_bytes()
+    write_bytes = Path.write_bytes
+
+    def full(self: Path, content: bytes) -> int:
+        write_bytes(self, content[:100])
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(Path, "write_bytes", full)
+    with pytest.raises(DataError, match=r"a\.ply: No space left on device"):
+        write_ply(path, make_splats(5, 0))
+    assert path.read_bytes() == old
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_folder_in_the_place_of_the_file_is_bad_data(tmp_path: Path) -> None:
+    (tmp_path / "a.ply").mkdir()
+    with pytest.raises(DataError, match="cannot write"):
+        write_ply(tmp_path / "a.ply", make_splats(1, 0))
+
+
+def test_reader_takes_any_order_other_types_and_further_elements(tmp_path: Path) -> None:
+    splats = make_splats(6, 2)
+    write_ply(tmp_path / "a.ply", splats)
+    lines, table = parse(tmp_path / "a.ply")
+    names = [line.split()[-1] for line in lines[3:]]
+    order = np.random.default_rng(3).permutation(len(names))
+    dtype = np.dtype([("label", "u1")] + [(names[i], "<f8") for i in order])
+    rows = np.zeros(6, dtype)
+    for i in order:
+        rows[names[i]] = table[:, i]
+    header = ["ply", "format binary_little_endian 1.0", "comment made by a test"]
+    header += ["element vertex 6", "property uchar label"]
+    header += [f"property double {names[i]}" for i in order]
+    header += ["element face 0", "property list uchar int vertex_indices", "end_header", ""]
+    path = tmp_path / "b.ply"
+    path.write_bytes("\r\n".join(header).encode() + rows.tobytes())
+    expected, found = read_ply(tmp_path / "a.ply"), read_ply(path)
+    for name, tensor in expected.tensors().items():
+        assert torch.equal(getattr(found, name), tensor), name
+
+
+def edit(content: bytes, kind: str) -> bytes:
+    """Return a broken variant of a PLY file."""
+    return {
+        "not a ply": b"solid cube\n" + content,
+        "empty": b"",
+        "ascii": content.replace(b"binary_little_endian", b"ascii"),
+        "no end of header": content[:60],
+        "truncated": content[:-1],
+        "negative count": content.replace(b"vertex 5", b"vertex -5"),
+        "huge count": content.replace(b"vertex 5", b"vertex 5" + b"0" * 30),
+        "missing property": content.replace(b"property float rot_2\n", b""),
+        "twice": content.replace(b"property float nx\n", b"property float x\n"),
+        "list": content.replace(b"property float nx", b"property list uchar int nx"),
+        "odd harmonics": content.replace(b"property float f_rest_8\n", b""),
+        "no properties": b"ply\nformat binary_little_endian 1.0\nelement vertex 5\nend_header\n",
+    }[kind]
+
+
+KINDS = [
+    "not a ply", "empty", "ascii", "no end of header", "truncated", "negative count",
+    "huge count", "missing property", "twice", "list", "odd harmonics", "no properties",
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_broken_files_are_bad_data_in_one_line(tmp_path: Path, kind: str) -> None:
+    path = tmp_path / "a.ply"
+    write_ply(path, make_splats(5, 1))
+    content = path.read_bytes()
+    broken = edit(content, kind)
+    assert broken != content
+    path.write_bytes(broken)
+    with pytest.raises(DataError) as caught:
+        read_ply(path)
+    assert str(path) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_missing_file_is_bad_data(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="cannot read"):
+        read_ply(tmp_path / "absent.ply")
+
+
+def test_ply_shows_the_moment_that_is_asked_for(tmp_path: Path) -> None:
+    model, told = Falling(make_splats(3, 1)), []
+    options = ExportOptions(time=0.25, progress=lambda *counts: told.append(counts))
+    target = tmp_path / "made" / "moment.ply"
+    assert ply_format.export(model, target, options) == [target]
+    assert torch.equal(read_ply(target).means, model.at(0.25).means)
+    assert told == [(1, 1)]
+    with pytest.raises(UsageError, match=r"does not end in \.ply"):
+        ply_format.export(model, tmp_path / "moment.obj", options)
+
+
+def test_sequence_spreads_its_frames_over_time(tmp_path: Path) -> None:
+    model, told = Falling(make_splats(3, 0)), []
+    options = ExportOptions(frames=5, progress=lambda *counts: told.append(counts))
+    paths = sequence_format.export(model, tmp_path / "run", options)
+    assert [path.name for path in paths] == [f"frame000{i}.ply" for i in range(1, 6)]
+    assert sorted((tmp_path / "run").iterdir()) == paths
+    for path, time in zip(paths, (0.0, 0.25, 0.5, 0.75, 1.0), strict=True):
+        assert torch.equal(read_ply(path).means, model.at(time).means)
+    assert told == [(i, 5) for i in range(1, 6)]
+
+
+def test_sequence_takes_given_times_and_a_single_frame(tmp_path: Path) -> None:
+    model = Falling(make_splats(2, 0))
+    paths = sequence_format.export(model, tmp_path / "a", ExportOptions(times=(0.1, 0.9)))
+    assert torch.equal(read_ply(paths[1]).means, model.at(0.9).means)
+    (path,) = sequence_format.export(model, tmp_path / "b", ExportOptions(frames=1))
+    assert torch.equal(read_ply(path).means, model.at(0.0).means)
+
+
+def test_sequence_refuses_to_mix_with_a_longer_one(tmp_path: Path) -> None:
+    model = Falling(make_splats(2, 0))
+    sequence_format.export(model, tmp_path, ExportOptions(frames=4))
+    sequence_format.export(model, tmp_path, ExportOptions(frames=4))
+    with pytest.raises(DataError, match=r"2 frames of another sequence, frame0003\.ply"):
+        sequence_format.export(model, tmp_path, ExportOptions(frames=2))
+
+
+def test_sequence_refuses_a_file_and_no_frames(tmp_path: Path) -> None:
+    model = Falling(make_splats(2, 0))
+    (tmp_path / "file").touch()
+    with pytest.raises(DataError, match="must name a folder"):
+        sequence_format.export(model, tmp_path / "file", ExportOptions(frames=2))
+    with pytest.raises(UsageError, match="--frames"):
+        sequence_format.export(model, tmp_path / "run", ExportOptions())
+
+
+@pytest.mark.parametrize("options", [{"time": 1.5}, {"times": (0.0, float("nan"))}, {"frames": -1}])
+def test_impossible_options_are_refused(options: dict[str, object]) -> None:
+    with pytest.raises(UsageError):
+        ExportOptions(**options)
+
+
+def test_formats_are_found_without_loading_torch() -> None:
+    assert {"ply", "ply_sequence"} <= set(plugins.names("gsdmsr_cli.exports"))
+    code = "import sys, gsdmsr_cli.exports; sys.exit('torch' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -1,0 +1,167 @@
+"""Every engine is held to the float64 reference, picture and gradient, at awkward sizes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import cache
+
+import pytest
+import torch
+from raster_scenes import CASES, Case, Drawing, ambiguous, case, draw, pixel_weights, poisoned
+from torch import Tensor
+
+from gsdmsr_cli.raster import Engine, engine_names, load_engine, reference
+from gsdmsr_cli.splatting_constants import ALPHA_MAX, TRANSMITTANCE_STOP
+
+FORWARD = 1e-4  # largest error of a pixel; of depth, relative to the farthest splat
+BACKWARD = 1e-3  # error of a gradient in the L2 norm, relative
+MOST_AMBIGUOUS = 0.02  # share of pixels too close to a threshold to be compared
+
+Placed = tuple[Engine, str]
+
+
+@pytest.fixture(scope="module", params=[name for name in engine_names() if name != "reference"])
+def placed(request: pytest.FixtureRequest) -> Placed:
+    """An engine and the device it draws on."""
+    engine = load_engine(request.param)
+    reasons = {device: engine.unavailable(device) for device in ("cpu", "cuda")}
+    for device, reason in reasons.items():
+        if reason is None:
+            return engine, device
+    pytest.skip(f"engine {request.param} cannot run: {reasons}")
+
+
+@cache
+def drawings(placed: Placed, name: str) -> tuple[Drawing, Drawing]:
+    """The case as the engine draws it in float32 and as the reference does in float64."""
+    engine, device = placed
+    weights = pixel_weights(case(name))
+    found = draw(engine, case(name), weights, device, torch.float32)
+    return found, draw(reference, case(name), weights, "cpu", torch.float64)
+
+
+def drawing_that_never_stops(name: str) -> Drawing:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(reference, "TRANSMITTANCE_STOP", 0.0)
+        return draw(reference, case(name), pixel_weights(case(name)), "cpu", torch.float64)
+
+
+def farthest(of: Case, radii: Tensor) -> float:
+    """Greatest camera z of the drawn splats, not below 1: the scale of the depth image."""
+    view, means = of.camera, of.splats.means[radii > 0].double()
+    depths = means @ torch.tensor(view.rotation[2]) + view.translation[2]
+    return max([1.0, *depths.tolist()])
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_pictures_match_the_reference(placed: Placed, name: str) -> None:
+    found, exact = drawings(placed, name)
+    compared = ~ambiguous(case(name))
+    assert compared.double().mean() >= 1 - MOST_AMBIGUOUS
+    assert found.frame.rgb.dtype == torch.float32
+    for image in ("rgb", "alpha", "depth"):
+        ours, truth = getattr(found.frame, image), getattr(exact.frame, image)
+        assert (ours is None) == (truth is None) == (image == "depth" and not case(name).with_depth)
+        if truth is not None:
+            assert ours.shape == truth.shape
+            scale = farthest(case(name), exact.frame.radii) if image == "depth" else 1.0
+            assert (ours - truth)[compared].abs().max() <= FORWARD * scale, image
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_gradients_match_the_reference(placed: Placed, name: str) -> None:
+    found, exact = drawings(placed, name)
+    right = [exact, drawing_that_never_stops(name)] if case(name).past_stop else [exact]
+    for tensor, ours in found.gradients.items():
+        truths = [drawing.gradients[tensor] for drawing in right]
+        assert ours.shape == truths[0].shape
+        assert any((ours - truth).norm() <= BACKWARD * truth.norm() for truth in truths), tensor
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_radii_and_screen_means_match_the_reference(placed: Placed, name: str) -> None:
+    found, exact = (drawing.frame for drawing in drawings(placed, name))
+    # Engines may round a radius up, and drop a splat that touches no pixel centre.
+    assert not found.radii[exact.radii == 0].any()
+    drawn = found.radii > 0
+    assert drawn.sum() >= 0.9 * (exact.radii > 0).sum()
+    excess = found.radii[drawn] - exact.radii[drawn]
+    tolerance = 1e-3 * (1 + exact.radii[drawn])
+    assert ((excess > -tolerance) & (excess < 1 + tolerance)).all()
+    torch.testing.assert_close(
+        found.means2d[drawn].double(), exact.means2d[drawn], atol=1e-3, rtol=1e-5
+    )
+
+
+def test_cases_reach_the_places_they_are_named_after() -> None:
+    drawn = {
+        name: draw(reference, case(name), pixel_weights(case(name)), "cpu", torch.float64)
+        for name in CASES
+    }
+    for name in CASES.keys() - {"zero splats", "none in view"}:
+        assert drawn[name].frame.alpha.max() > 0.1, name
+        for tensor, gradient in drawn[name].gradients.items():
+            assert gradient.norm() > 0, (name, tensor)
+
+    def count(name: str) -> int:
+        return int((drawn[name].frame.radii > 0).sum())
+
+    assert count("more than a batch in a tile") > 600
+    assert count("more than a batch in a tile, opaque") > 600
+    assert drawn["more than a batch in a tile, opaque"].frame.alpha.max() > 1 - TRANSMITTANCE_STOP
+    assert count("behind and at the near plane") == 20
+    assert count("outside the margin") == 5
+    assert count("none in view") == 0
+    assert drawn["saturated"].frame.alpha.max() > ALPHA_MAX
+
+
+def test_rows_that_are_not_finite_are_as_if_absent(placed: Placed) -> None:
+    sick, healthy, finite = poisoned()
+    weights = pixel_weights(sick)
+    found = draw(placed[0], sick, weights, placed[1], torch.float32)
+    expected = draw(placed[0], healthy, weights, placed[1], torch.float32)
+    for image in ("rgb", "alpha", "depth"):
+        torch.testing.assert_close(
+            getattr(found.frame, image), getattr(expected.frame, image), atol=1e-6, rtol=0
+        )
+    absent = torch.ones(len(sick.splats), dtype=torch.bool)
+    absent[finite] = False
+    assert not found.frame.radii[absent].any()
+    for name, gradient in found.gradients.items():
+        assert not gradient[absent].any(), name
+        torch.testing.assert_close(gradient[finite], expected.gradients[name])
+
+
+def test_zero_splats_give_the_background(placed: Placed) -> None:
+    frame = drawings(placed, "zero splats")[0].frame
+    assert torch.equal(frame.rgb, case("zero splats").background.expand_as(frame.rgb))
+    assert not frame.alpha.any()
+
+
+@pytest.fixture
+def numba_threads() -> Iterator[None]:
+    numba = pytest.importorskip("numba")
+    before = numba.get_num_threads()
+    yield
+    numba.set_num_threads(before)
+
+
+@pytest.mark.usefixtures("numba_threads")
+@pytest.mark.parametrize("name", ["64x48", "more than a batch in a tile"])
+def test_result_does_not_depend_on_the_number_of_threads(name: str) -> None:
+    import numba
+
+    if "cpu" not in engine_names():
+        pytest.skip("there is no engine cpu")
+    if numba.config.NUMBA_NUM_THREADS < 2:
+        pytest.skip("numba was started with one thread")
+    engine, weights = load_engine("cpu"), pixel_weights(case(name))
+    drawn = []
+    for threads in (1, 2):
+        numba.set_num_threads(threads)
+        drawn.append(draw(engine, case(name), weights, "cpu", torch.float32))
+    one, two = drawn
+    for image, pixels in vars(one.frame).items():
+        assert torch.equal(pixels, getattr(two.frame, image)), image
+    for tensor, gradient in one.gradients.items():
+        assert torch.equal(gradient, two.gradients[tensor]), tensor

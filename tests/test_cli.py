@@ -1,0 +1,229 @@
+"""The command line: what each command is called with, and how every error ends."""
+
+from __future__ import annotations
+
+import errno
+import subprocess
+import sys
+import time
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import typer
+
+from gsdmsr_cli import __version__, cli, commands
+from gsdmsr_cli.errors import DataError, GsdmsrError, ThresholdError, UsageError
+from gsdmsr_cli.preset import load_preset
+
+
+class Gsdmsr:
+    """Runs the command line in this process, with commands that record their arguments."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.monkeypatch = monkeypatch
+        self.calls: list[tuple[str, tuple[Any, ...]]] = []
+        self.failure: BaseException | None = None
+        for name in ("train", "eval", "render", "export", "demo", "doctor", "benchmark"):
+            fake = SimpleNamespace(run=lambda *arguments, name=name: self.record(name, arguments))
+            monkeypatch.setattr(commands, name, fake, raising=False)
+
+    def record(self, name: str, arguments: tuple[Any, ...]) -> None:
+        self.calls.append((name, arguments))
+        if self.failure is not None:
+            raise self.failure
+
+    def __call__(self, line: str) -> int:
+        self.monkeypatch.setattr(sys, "argv", ["gsdmsr", *line.split()])
+        with pytest.raises(SystemExit) as ended:
+            cli.main()
+        assert isinstance(ended.value.code, int)
+        return ended.value.code
+
+
+@pytest.fixture
+def gsdmsr(monkeypatch: pytest.MonkeyPatch) -> Gsdmsr:
+    monkeypatch.delenv("GSDMSR_DEBUG", raising=False)
+    return Gsdmsr(monkeypatch)
+
+
+def python(*arguments: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, *arguments], capture_output=True, text=True, timeout=60, check=False
+    )
+
+
+def test_help_is_fast_and_lists_every_command() -> None:
+    python("-m", "gsdmsr_cli.cli", "--help")  # the first run may compile
+    start = time.perf_counter()
+    done = python("-m", "gsdmsr_cli.cli", "--help")
+    # about 0.25 s on an idle machine; the bound allows for a busy one
+    assert time.perf_counter() - start < 2.0
+    assert done.returncode == 0
+    for name in ("train", "eval", "render", "export", "demo", "doctor", "benchmark"):
+        assert name in done.stdout
+
+
+def test_the_command_line_imports_nothing_heavy() -> None:
+    heavy = ("torch", "numpy", "numba", "cv2", "yaml")
+    done = python(
+        "-c", f"import gsdmsr_cli.cli, sys; print([m for m in {heavy} if m in sys.modules])"
+    )
+    assert done.stdout.strip() == "[]"
+
+
+def test_version(gsdmsr: Gsdmsr, capsys: pytest.CaptureFixture[str]) -> None:
+    assert gsdmsr("--version") == 0
+    assert capsys.readouterr().out == f"gsdmsr {__version__}\n"
+
+
+@pytest.mark.parametrize(
+    ("line", "name", "arguments"),
+    [
+        (
+            "train --data d --out r",
+            "train",
+            (Path("d"), Path("r"), None, None, [], "auto", False, False),
+        ),
+        (
+            "train --data d --out r --preset dnerf --config f.yaml --set a.b=1 --set a.c=2"
+            " --device cpu --resume",
+            "train",
+            (Path("d"), Path("r"), "dnerf", Path("f.yaml"), ["a.b=1", "a.c=2"], "cpu", True, False),
+        ),
+        ("eval r", "eval", (Path("r"), "test", None, None, None, False, [])),
+        (
+            "eval r --split val --background black --downscale 2 --lpips-weights w --json"
+            " --fail-under psnr=25 --fail-under ssim=0.9",
+            "eval",
+            (Path("r"), "val", "black", 2, Path("w"), True, ["psnr=25", "ssim=0.9"]),
+        ),
+        ("render r", "render", (Path("r"), None, None, None)),
+        (
+            "render r --path orbit --frames 9 --out o",
+            "render",
+            (Path("r"), "orbit", 9, Path("o")),
+        ),
+        (
+            "export r --format ply --time 0.5 --out o",
+            "export",
+            (Path("r"), "ply", 0.5, None, Path("o")),
+        ),
+        (
+            "export r --format ply-sequence --frames 3 --out o",
+            "export",
+            (Path("r"), "ply-sequence", None, 3, Path("o")),
+        ),
+        ("demo", "demo", (Path("gsdmsr-demo"),)),
+        ("doctor --json", "doctor", (True,)),
+        ("benchmark kernels --yardstick y --json", "benchmark", (Path("y"), True)),
+    ],
+)
+def test_commands_get_typed_arguments(
+    line: str, name: str, arguments: tuple[Any, ...], gsdmsr: Gsdmsr
+) -> None:
+    assert gsdmsr(line) == 0
+    assert gsdmsr.calls == [(name, arguments)]
+
+
+def overrides_of(gsdmsr: Gsdmsr, options: str) -> list[str]:
+    assert gsdmsr(f"train --data d --out r {options}") == 0
+    overrides = gsdmsr.calls[-1][1][4]
+    assert isinstance(overrides, list)
+    return overrides
+
+
+def test_the_convenience_options_of_train_become_overrides(gsdmsr: Gsdmsr) -> None:
+    options = "--budget 8m --downscale 2 --background black --seed 7 --threads 3"
+    preset = load_preset(None, None, overrides_of(gsdmsr, f"--set training.seed=5 {options}"))
+    assert (preset.training.budget, preset.training.seed, preset.training.threads) == ("8m", 7, 3)
+    assert (preset.data.downscale, preset.data.background) == (2, "black")
+
+
+def test_steps_put_an_end_to_a_budget(gsdmsr: Gsdmsr) -> None:
+    overrides = overrides_of(gsdmsr, "--set training.budget=8m --steps 50")
+    training = load_preset(None, None, overrides).training
+    assert (training.steps, training.budget) == (50, None)
+
+
+def test_a_budget_without_a_unit_is_refused_as_text(gsdmsr: Gsdmsr) -> None:
+    with pytest.raises(UsageError, match='budget is "8"; allowed: null'):
+        load_preset(None, None, overrides_of(gsdmsr, "--budget 8"))
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("--foo", "--foo"),
+        ("trian", "trian"),
+        ("train --out r", "--data"),
+        ("train --data d --out r --step 3", "--steps"),
+        ("train --data d --out r --steps x", "--steps"),
+        ("train --data d --out r --device tpu", "--device"),
+        ("train --data d --out r --steps 3 --budget 8m", "--budget and --steps"),
+        ("train --data d --out r --resume --overwrite", "--resume and --overwrite"),
+        ("eval", "RUN"),
+        ("eval r --split train", "--split"),
+        ("eval r --downscale 0", "--downscale"),
+        ("render r --frames 0", "--frames"),
+        ("export r --format obj --out o", "--format"),
+        ("export r --format ply --time 1.5 --out o", "--time"),
+        ("benchmark", "missing command"),
+        ("doctor extra", "extra"),
+    ],
+)
+def test_usage_errors_are_one_line_and_exit_2(
+    line: str, message: str, gsdmsr: Gsdmsr, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert gsdmsr(line) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("error: ")
+    assert error.count("\n") == 1
+    assert message in error
+    assert gsdmsr.calls == []
+
+
+@pytest.mark.parametrize(
+    ("failure", "code", "message"),
+    [
+        (GsdmsrError("general"), 1, "general"),
+        (UsageError("two\nlines"), 2, "two lines"),
+        (DataError("d/x.png: truncated"), 3, "d/x.png: truncated"),
+        (ThresholdError("psnr"), 4, "psnr"),
+        (
+            OSError(errno.ENOSPC, "No space left on device", "r/a"),
+            3,
+            "r/a: No space left on device",
+        ),
+        (PermissionError(errno.EACCES, "Permission denied"), 3, "Permission denied"),
+        (
+            ZeroDivisionError("division by zero"),
+            1,
+            "internal: ZeroDivisionError: division by zero (set GSDMSR_DEBUG=1 for the traceback)",
+        ),
+    ],
+)
+def test_failures_are_one_line_and_their_code(
+    failure: Exception, code: int, message: str, gsdmsr: Gsdmsr, capsys: pytest.CaptureFixture[str]
+) -> None:
+    gsdmsr.failure = failure
+    assert gsdmsr("doctor --json") == code
+    assert capsys.readouterr() == ("", f"error: {message}\n")
+
+
+@pytest.mark.parametrize("failure", [KeyboardInterrupt(), typer.Abort()])
+def test_an_interrupt_exits_130(failure: BaseException, gsdmsr: Gsdmsr) -> None:
+    gsdmsr.failure = failure
+    assert gsdmsr("doctor") == 130
+
+
+def test_debug_shows_the_traceback(
+    gsdmsr: Gsdmsr, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("GSDMSR_DEBUG", "1")
+    gsdmsr.failure = ZeroDivisionError("division by zero")
+    assert gsdmsr("doctor") == 1
+    error = capsys.readouterr().err
+    assert "Traceback" in error
+    assert error.splitlines()[-1].startswith("error: internal: ZeroDivisionError")

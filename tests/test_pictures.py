@@ -1,0 +1,149 @@
+"""The cache of targets: right pixels, right cameras, bounded memory, any thread."""
+
+from __future__ import annotations
+
+from collections import Counter
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from datasets import noise, write_picture
+
+from gsdmsr_cli import imaging
+from gsdmsr_cli.camera import Camera
+from gsdmsr_cli.errors import DataError
+from gsdmsr_cli.pictures import Pictures
+from gsdmsr_cli.scene import View
+
+WHITE = (1.0, 1.0, 1.0)
+SIDE = 8
+BYTES = 3 * SIDE * SIDE
+
+
+def make_view(path: Path, width: int = SIDE, height: int = SIDE) -> View:
+    camera = Camera(np.eye(4), 20.0, 22.0, width / 2, height / 2, width, height)
+    return View(path.stem, camera, 0.0, "train", path)
+
+
+@pytest.fixture
+def views(tmp_path: Path) -> list[View]:
+    paths = [tmp_path / f"{i}.png" for i in range(5)]
+    for i, path in enumerate(paths):
+        write_picture(path, noise(SIDE, SIDE, seed=i))
+    return [make_view(path) for path in paths]
+
+
+@pytest.fixture
+def decoded(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
+    """How often each file was read."""
+    counts: Counter[str] = Counter()
+    read = imaging.read_image
+
+    def counting(path: Path) -> np.ndarray:
+        counts[path.stem] += 1
+        return read(path)
+
+    monkeypatch.setattr(imaging, "read_image", counting)
+    return counts
+
+
+@pytest.mark.parametrize(("downscale", "width", "height"), [(1, 9, 6), (2, 4, 3), (3, 3, 2)])
+def test_picture_is_composited_and_shrunk_in_float(
+    tmp_path: Path, downscale: int, width: int, height: int
+) -> None:
+    rgba = noise(6, 9, seed=3)
+    write_picture(tmp_path / "a.png", rgba)
+    view = make_view(tmp_path / "a.png", 9, 6)
+    background = (0.25, 0.5, 1.0)
+    pictures = Pictures(background, downscale, 10**6)
+    picture = pictures.load(view)
+    assert picture.dtype == torch.uint8 and picture.is_contiguous()
+    assert picture.shape == (3, height, width)
+
+    alpha = rgba[..., 3:] / 255
+    over = rgba[..., :3] / 255 * alpha + np.array(background) * (1 - alpha)
+    expected = shrink(over, height, width) * 255
+    found = picture.permute(1, 2, 0).numpy().astype(float)
+    assert np.abs(found - expected).max() <= 0.5 + 1e-3
+
+    camera = pictures.camera(view)
+    assert (camera.width, camera.height) == (width, height)
+    assert camera.fx == pytest.approx(20 * width / 9)
+    assert camera.cy == pytest.approx(height / 2)
+
+
+def shrink(image: np.ndarray, height: int, width: int) -> np.ndarray:
+    """Area means as a product of two matrices of overlaps."""
+
+    def overlaps(old: int, new: int) -> np.ndarray:
+        edges = np.arange(new + 1) * old / new
+        low, high = edges[:-1, None], edges[1:, None]
+        cover = np.minimum(high, np.arange(1, old + 1)) - np.maximum(low, np.arange(old))
+        return cover.clip(0) * new / old
+
+    rows, columns = overlaps(image.shape[0], height), overlaps(image.shape[1], width)
+    return np.einsum("hi,wj,ijc->hwc", rows, columns, image)
+
+
+def test_a_picture_of_another_size_than_its_camera_is_refused(tmp_path: Path) -> None:
+    write_picture(tmp_path / "a.png", noise(6, 9))
+    with pytest.raises(DataError, match=r"a\.png is 9 x 6 px, but its camera is 6 x 9"):
+        Pictures(WHITE, 1, 10**6).load(make_view(tmp_path / "a.png", 6, 9))
+
+
+def test_a_picture_is_decoded_once(views: list[View], decoded: Counter[str]) -> None:
+    pictures = Pictures(WHITE, 1, 10**6)
+    assert pictures.load(views[0]) is pictures.load(views[0])
+    assert decoded == {"0": 1}
+
+
+def test_the_least_recently_used_goes_first(views: list[View], decoded: Counter[str]) -> None:
+    pictures = Pictures(WHITE, 1, 2 * BYTES)
+    for i in (0, 1, 0, 2):  # 1 is the oldest when 2 comes.
+        pictures.load(views[i])
+    pictures.load(views[0])
+    assert decoded == {"0": 1, "1": 1, "2": 1}
+    pictures.load(views[1])
+    assert decoded == {"0": 1, "1": 2, "2": 1}
+
+
+def test_a_picture_above_the_limit_is_returned_but_not_kept(
+    views: list[View], decoded: Counter[str]
+) -> None:
+    pictures = Pictures(WHITE, 1, BYTES - 1)
+    torch.testing.assert_close(pictures.load(views[0]), pictures.load(views[0]))
+    assert decoded == {"0": 2}
+
+
+def test_preload_stops_at_the_limit_and_tells(views: list[View], decoded: Counter[str]) -> None:
+    pictures = Pictures(WHITE, 1, 3 * BYTES)
+    told: list[tuple[int, int]] = []
+    pictures.preload(views, lambda done, total: told.append((done, total)))
+    assert told == [(1, 3), (2, 3), (3, 3)]
+    assert decoded == {"0": 1, "1": 1, "2": 1}
+    for view in views[:3]:
+        pictures.load(view)
+    assert decoded.total() == 3
+
+
+def test_preload_raises_what_a_picture_raises(views: list[View]) -> None:
+    views[2].image_path.unlink()
+    with pytest.raises(DataError, match=r"2\.png does not exist"):
+        Pictures(WHITE, 1, 10**6).preload(views)
+
+
+def test_many_threads_get_the_same_pictures(views: list[View]) -> None:
+    expected = [Pictures(WHITE, 2, 10**6).load(view) for view in views]
+    pictures = Pictures(WHITE, 2, 2 * BYTES // 4)
+    order = np.random.default_rng(0).integers(0, 5, 200)
+    with ThreadPoolExecutor(8) as pool:
+        found = list(pool.map(lambda i: pictures.load(views[i]), order))
+    for i, picture in zip(order, found, strict=True):
+        assert torch.equal(picture, expected[i])
+
+
+def test_downscale_below_one_is_a_mistake() -> None:
+    with pytest.raises(ValueError, match="downscale"):
+        Pictures(WHITE, 0, 1)
