@@ -14,6 +14,22 @@ Floats = NDArray[np.float32]
 _AHEAD = 1e-4  # an entry nearer than this [world units] is the surface that the ray starts on
 
 
+def column(*values: float) -> Floats:
+    """Return the values as one (V, 1) column."""
+    return np.array(values, np.float32)[:, None]
+
+
+def dot(first: Floats, second: Floats) -> Floats:
+    """Return the (R,) dot products of the columns of two (3, R); either may be (3, 1)."""
+    products: Floats = first[0] * second[0] + first[1] * second[1] + first[2] * second[2]
+    return products
+
+
+_FACE_COLOURS = np.array(
+    [[0.15, 0.20, 0.95], [0.45, 0.65, 0.75], [0.85, 0.40, 0.20]], np.float32
+)  # (rgb, axis)
+
+
 class Solid(Protocol):
     """A convex shape about its own origin."""
 
@@ -45,12 +61,12 @@ class Disc:
         with np.errstate(divide="ignore", invalid="ignore"):
             distances = -origins[2] / directions[2]
             points = origins[:2] + distances * directions[:2]
-        inside = (points * points).sum(0) < self.radius**2
+        inside = points[0] ** 2 + points[1] ** 2 < self.radius**2
         return _ahead(distances, inside)
 
     def normals(self, points: Floats) -> Floats:
         """See Solid."""
-        return np.broadcast_to(np.float32([[0], [0], [1]]), points.shape)
+        return np.broadcast_to(column(0, 0, 1), points.shape)
 
     def colours(self, points: Floats) -> Floats:
         """See Solid."""
@@ -95,7 +111,7 @@ class Box:
 
     def intersect(self, origins: Floats, directions: Floats) -> Floats:
         """See Solid; the ray is inside where it is between all three pairs of faces."""
-        half = np.float32(self.half)[:, None]
+        half = column(*self.half)
         with np.errstate(divide="ignore", invalid="ignore"):
             first, second = (-half - origins) / directions, (half - origins) / directions
         entry = np.minimum(first, second).max(0)
@@ -104,7 +120,8 @@ class Box:
 
     def _faces(self, points: Floats) -> NDArray[np.intp]:
         """Return the (R,) axis of the face that each point lies on."""
-        return np.abs(points / np.float32(self.half)[:, None]).argmax(0)
+        faces: NDArray[np.intp] = np.abs(points / column(*self.half)).argmax(0)
+        return faces
 
     def normals(self, points: Floats) -> Floats:
         """See Solid."""
@@ -116,9 +133,9 @@ class Box:
         cells = np.floor(points / np.float32(0.15) + np.float32(0.5))
         on_face = np.arange(3)[:, None] == self._faces(points)
         dark = np.where(on_face, 0, cells).sum(0) % 2 > 0
-        palette = np.float32([[0.15, 0.45, 0.85], [0.20, 0.65, 0.40], [0.95, 0.75, 0.20]])
-        plain = palette[self._faces(points)].T
-        return np.where(dark, plain * np.float32(0.45), plain)
+        plain = _FACE_COLOURS[:, self._faces(points)]
+        shaded: Floats = np.where(dark, plain * np.float32(0.45), plain)
+        return shaded
 
 
 @dataclass(frozen=True)
@@ -140,16 +157,15 @@ class Capsule:
 
     def intersect(self, origins: Floats, directions: Floats) -> Floats:
         """See Solid; the first of the entries into the open cylinder and the two end spheres."""
-        a = (directions[:2] ** 2).sum(0)
-        b = (origins[:2] * directions[:2]).sum(0)
-        c = (origins[:2] ** 2).sum(0) - np.float32(self.thickness**2)
+        a = directions[0] ** 2 + directions[1] ** 2
+        b = origins[0] * directions[0] + origins[1] * directions[1]
+        c = origins[0] ** 2 + origins[1] ** 2 - np.float32(self.thickness**2)
         with np.errstate(divide="ignore", invalid="ignore"):
             side = (-b - np.sqrt(b * b - a * c)) / a
             beside = np.abs(origins[2] + side * directions[2]) <= self.half
         found = _ahead(side, beside)
         for end in (-self.half, self.half):
-            offset = np.float32([[0], [0], [end]])
-            cap = _enter_sphere(origins - offset, directions, self.thickness)
+            cap = _enter_sphere(origins - column(0, 0, end), directions, self.thickness)
             found = np.minimum(found, cap)
         return found
 
@@ -166,8 +182,8 @@ class Capsule:
 
 
 def _enter_sphere(origins: Floats, directions: Floats, radius: float) -> Floats:
-    along = (origins * directions).sum(0)
-    discriminant = along * along - (origins * origins).sum(0) + np.float32(radius**2)
+    along = dot(origins, directions)
+    discriminant = along * along - dot(origins, origins) + np.float32(radius**2)
     root = np.sqrt(discriminant.clip(min=0))
     return _ahead(-along - root, discriminant > 0)
 
@@ -182,4 +198,4 @@ def _two_tone(
     mask: NDArray[np.bool_], one: tuple[float, float, float], other: tuple[float, float, float]
 ) -> Floats:
     """Return (3, R) colours: ``one`` where the mask holds, ``other`` elsewhere."""
-    return np.where(mask, np.float32(one)[:, None], np.float32(other)[:, None])
+    return np.where(mask, column(*one), column(*other))

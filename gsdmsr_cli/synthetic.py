@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from gsdmsr_cli.camera import Camera, look_at
 from gsdmsr_cli.imaging import write_png
-from gsdmsr_cli.solids import Ball, Box, Capsule, Disc, Floats, Solid
+from gsdmsr_cli.solids import Ball, Box, Capsule, Disc, Floats, Solid, column, dot
 
 CAMERA_ANGLE_X = 0.6911
 """Horizontal field of view [rad], as in the D-NeRF scenes."""
@@ -27,15 +27,15 @@ CAMERA_ANGLE_X = 0.6911
 CAMERA_RADIUS = 4.0
 """Distance of every camera from the origin [world units]."""
 
-FLOOR = -0.8
+FLOOR = -0.65
 """Height of the ground [world units]."""
 
 BALL_RADIUS = 0.3
 """Radius of the bouncing ball [world units]."""
 
 _SAMPLES = 3  # per pixel and axis
-_AMBIENT, _DIFFUSE = 0.4, 0.6
-_TO_LIGHT = np.array([0.40, -0.25, 0.88]) / np.linalg.norm([0.40, -0.25, 0.88])
+_AMBIENT, _DIFFUSE = np.float32(0.4), np.float32(0.6)
+_TO_LIGHT = column(0.40, -0.25, math.sqrt(1 - 0.40**2 - 0.25**2))  # of unit length
 _GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
 
 
@@ -55,16 +55,17 @@ class Placed:
 
     def local(self, vectors: Floats) -> Floats:
         """Return (3, R) world directions in the solid's axes."""
-        return (self.rotation.T.astype(np.float32)) @ vectors
+        rotated: Floats = self.rotation.T.astype(np.float32) @ vectors
+        return rotated
 
     def distances(self, origins: Floats, directions: Floats) -> Floats:
         """Return where (3, R) rays enter, (R,) [world units]; inf where they miss.
 
         Either argument may be (3, 1). Only rays that touch the bounding sphere are intersected.
         """
-        offsets = origins - self.position.astype(np.float32)[:, None]
-        along = (offsets * directions).sum(0)
-        beside = (offsets * offsets).sum(0) - along * along
+        offsets = origins - column(*self.position)
+        along = dot(offsets, directions)
+        beside = dot(offsets, offsets) - along * along
         rows = np.flatnonzero(beside < self.solid.radius**2)
         found = np.full(along.shape, np.inf, np.float32)
         origins, directions = (
@@ -81,7 +82,7 @@ def solids_at(time: float) -> list[Placed]:
     swing = _rotation("y", 0.6 * math.sin(2 * math.pi * time))
     pivot = np.array([0.0, 0.55, 0.9])
     return [
-        Placed(Disc(1.25), np.eye(3), np.array([0.0, 0.0, FLOOR])),
+        Placed(Disc(1.15), np.eye(3), np.array([0.0, 0.0, FLOOR])),
         Placed(Ball(BALL_RADIUS), np.eye(3), ball_centre(height)),
         Placed(
             Box((0.3, 0.22, 0.35)),
@@ -100,7 +101,7 @@ def ball_centre(height: float) -> NDArray[np.float64]:
 def draw(placed: list[Placed], camera: Camera) -> NDArray[np.uint8]:
     """Return the (H, W, 4) picture with straight alpha, anti-aliased by 3 x 3 rays a pixel."""
     directions = _rays(camera)
-    centre = camera.centre.astype(np.float32)[:, None]
+    centre = column(*camera.centre)
     distances = np.stack([solid.distances(centre, directions) for solid in placed])
     nearest, owner = distances.min(0), distances.argmin(0)
     colours = np.zeros_like(directions)
@@ -117,11 +118,10 @@ def _shade(solid: Placed, points: Floats, others: list[Placed]) -> Floats:
 
     The solids are convex, so that none throws a shadow on a side of its own that faces the light.
     """
-    to_light = _TO_LIGHT.astype(np.float32)[:, None]
-    local = solid.local(points - solid.position.astype(np.float32)[:, None])
-    facing = (solid.solid.normals(local) * solid.local(to_light)).sum(0).clip(min=0)
+    local = solid.local(points - column(*solid.position))
+    facing = dot(solid.solid.normals(local), solid.local(_TO_LIGHT)).clip(min=0)
     for other in others:
-        facing[np.isfinite(other.distances(points, to_light))] = 0
+        facing[np.isfinite(other.distances(points, _TO_LIGHT))] = 0
     return solid.solid.colours(local) * (_AMBIENT + _DIFFUSE * facing)
 
 
@@ -143,7 +143,8 @@ def _resolve(colours: Floats, hit: NDArray[np.bool_], camera: Camera) -> NDArray
     total = colours.reshape(3, *cells).sum((2, 4))
     rgb = total / np.maximum(count, 1)
     pixels = np.stack([*rgb, count / _SAMPLES**2], axis=-1)
-    return np.rint(pixels.clip(0, 1) * 255).astype(np.uint8)
+    rounded: NDArray[np.uint8] = np.rint(pixels.clip(0, 1) * 255).astype(np.uint8)
+    return rounded
 
 
 def _rotation(axis: str, angle: float) -> NDArray[np.float64]:
@@ -165,6 +166,15 @@ def camera_on_dome(azimuth: float, elevation: float, size: int) -> Camera:
     return Camera(pose, focal, focal, size / 2, size / 2, size, size)
 
 
+@dataclass(frozen=True, eq=False)
+class Shot:
+    """One picture to draw: its path in the scene's folder without suffix, moment and camera."""
+
+    name: str
+    time: float
+    camera: Camera
+
+
 def write_scene(
     folder: Path,
     size: int = 200,
@@ -177,31 +187,29 @@ def write_scene(
     """Write the scene into ``folder``: RGBA pictures of ``size`` x ``size`` px and three splits.
 
     Every split spans the times 0 to 1 evenly. Train and val cameras lie all over the upper half of
-    a dome, one a moment; test cameras go round it once. ``progress`` is told (done, total) pictures.
-    The transforms are written last: a folder that has them is complete.
+    a dome, one a moment; test cameras go round it once. ``progress`` is told (done, total)
+    pictures. The transforms are written last: a folder that has them is complete.
 
     Raises:
         DataError: a picture cannot be written.
+        OSError: a folder or the transforms cannot be written.
     """
     generator = np.random.default_rng(seed)
-    cameras = {
-        "train": _scattered(train, size, generator),
-        "val": _scattered(val, size, generator),
-        "test": [camera_on_dome(2 * math.pi * i / test, 0.55, size) for i in range(test)],
+    splits = {
+        "train": _shots("train", _scattered(train, size, generator)),
+        "val": _shots("val", _scattered(val, size, generator)),
+        "test": _shots("test", _circle(test, size)),
     }
-    jobs = []
-    for split, group in cameras.items():
+    for split in splits:
         (folder / split).mkdir(parents=True, exist_ok=True)
-        jobs += [(_picture(split, i), t, c) for (i, c), t in zip(enumerate(group), _times(group))]
-    _draw_all(folder, jobs, progress)
-    for split, group in cameras.items():
-        document = _transforms(split, group)
+    _draw_all(folder, [shot for shots in splits.values() for shot in shots], progress)
+    for split, shots in splits.items():
         path = folder / f"transforms_{split}.json"
-        path.write_text(json.dumps(document, indent=1), encoding="utf-8")
+        path.write_text(json.dumps(_transforms(shots), indent=1), encoding="utf-8")
 
 
 def _scattered(count: int, size: int, generator: np.random.Generator) -> list[Camera]:
-    """Return cameras spread evenly over the dome, 10 to 75 degrees up, jittered, in random order."""
+    """Return cameras spread evenly over the dome, 10 to 75 degrees up, in random order."""
     heights = (generator.permutation(count) + generator.random(count)) / count
     lowest, highest = math.sin(math.radians(10)), math.sin(math.radians(75))
     start = generator.uniform(0, 2 * math.pi)
@@ -213,39 +221,35 @@ def _scattered(count: int, size: int, generator: np.random.Generator) -> list[Ca
     ]
 
 
-def _times(group: list[Camera]) -> list[float]:
-    return [i / max(len(group) - 1, 1) for i in range(len(group))]
+def _circle(count: int, size: int) -> list[Camera]:
+    return [camera_on_dome(2 * math.pi * i / count, 0.55, size) for i in range(count)]
 
 
-def _picture(split: str, index: int) -> str:
-    return f"{split}/r_{index:03d}"
+def _shots(split: str, cameras: list[Camera]) -> list[Shot]:
+    last = max(len(cameras) - 1, 1)
+    return [Shot(f"{split}/r_{i:03d}", i / last, camera) for i, camera in enumerate(cameras)]
 
 
-def _draw_all(
-    folder: Path,
-    jobs: list[tuple[str, float, Camera]],
-    progress: Callable[[int, int], None] | None,
-) -> None:
-    def work(job: tuple[str, float, Camera]) -> None:
-        name, time, camera = job
-        write_png(folder / f"{name}.png", draw(solids_at(time), camera))
+def _draw_all(folder: Path, shots: list[Shot], progress: Callable[[int, int], None] | None) -> None:
+    def work(shot: Shot) -> None:
+        write_png(folder / f"{shot.name}.png", draw(solids_at(shot.time), shot.camera))
 
     # NumPy lets go of the interpreter in its loops, so threads do share the work.
     with ThreadPoolExecutor(os.cpu_count()) as pool:
-        for done, _ in enumerate(pool.map(work, jobs), start=1):
+        for done, _ in enumerate(pool.map(work, shots), start=1):
             if progress is not None:
-                progress(done, len(jobs))
+                progress(done, len(shots))
 
 
-def _transforms(split: str, group: list[Camera]) -> dict[str, Any]:
+def _transforms(shots: list[Shot]) -> dict[str, Any]:
     """Return the JSON document of one split: camera-to-world in OpenGL axes (y up, z backward)."""
     to_opengl = np.diag([1.0, -1.0, -1.0, 1.0])
     frames = [
         {
-            "file_path": f"./{_picture(split, index)}",
-            "time": time,
-            "transform_matrix": (np.linalg.inv(camera.world_to_camera) @ to_opengl).tolist(),
+            "file_path": f"./{shot.name}",
+            "time": shot.time,
+            "transform_matrix": (np.linalg.inv(shot.camera.world_to_camera) @ to_opengl).tolist(),
         }
-        for (index, camera), time in zip(enumerate(group), _times(group), strict=True)
+        for shot in shots
     ]
     return {"camera_angle_x": CAMERA_ANGLE_X, "frames": frames}

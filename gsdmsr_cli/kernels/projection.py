@@ -30,6 +30,8 @@ ROUNDING = 2e-3
 _ROUNDING = float32(ROUNDING)
 _TINY = float32(1e-24)
 _ONE = float32(1)
+_LARGEST = float32(3e38)
+_LARGEST_DET = float32(1e36)
 _TWO = float32(2)
 
 
@@ -88,7 +90,7 @@ def _finite(means, quats, log_scales, logit_opacities, sh, i):
         total += quats[i, k]
     for k in range(sh.shape[1]):
         total += sh[i, k, 0] + sh[i, k, 1] + sh[i, k, 2]
-    return math.isfinite(total)
+    return abs(total) <= _LARGEST
 
 
 @parallel
@@ -156,7 +158,7 @@ def project(
         n0, n1, n2 = g1 * h2 - g2 * h1, g2 * h0 - g0 * h2, g0 * h1 - g1 * h0
         area = n0 * n0 + n1 * n1 + n2 * n2
         det = area + _DILATION * (gg + hh) + _DILATION * _DILATION
-        if not (math.isfinite(det) and math.isfinite(px + py)):
+        if not (det <= _LARGEST_DET and abs(px) <= _LARGEST and abs(py) <= _LARGEST):
             continue
         xx, yy = gg + _DILATION, hh + _DILATION
         extent = _TWO * math.log(opacity / _ALPHA_MIN)

@@ -1,1 +1,67 @@
-"""One file per motion: how splats move over time."""
+"""One file per motion: how splats move over time.
+
+A motion is a module of this package with ``Options``, a frozen dataclass of its settings, and
+``start(options, facts, generator) -> Motion``, which begins as the identity. Motions never import
+one another; what they share lies in ``gsdmsr_cli.fields``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import torch
+from torch import Tensor
+
+from gsdmsr_cli import plugins, strict
+from gsdmsr_cli.splats import Splats
+
+
+@dataclass(frozen=True)
+class Facts:
+    """What a motion may know of its scene; saved with every run.
+
+    Attributes:
+        bound: half edge of the box around the origin that holds the scene [world units].
+        frames: number of distinct train times.
+    """
+
+    bound: float
+    frames: int
+
+
+class Motion(Protocol):
+    """How N canonical splats move over time; mutable, since training changes its tensors."""
+
+    def at(self, splats: Splats, time: float) -> Splats:
+        """Return the splats at ``time`` in [0, 1]; row i of the result is row i of ``splats``."""
+
+    def take(self, rows: Tensor) -> None:
+        """Follow ``splats.take(rows)``: resize whatever is held per splat."""
+
+    def advance(self, progress: float) -> None:
+        """Enter the phase of training that belongs to ``progress`` in [0, 1]."""
+
+    def penalty(self) -> Tensor | None:
+        """Return the motion's regularisers at the present values, or None if it has none."""
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Return everything that is trained or saved, by name, in a fixed order."""
+
+    def groups(self) -> dict[str, str]:
+        """Return, for every trained tensor, the learning rate it follows: planes or network."""
+
+
+def start_motion(settings: Mapping[str, Any], facts: Facts, generator: torch.Generator) -> Motion:
+    """Make the motion ``settings["name"]`` with the rest of the settings as its options.
+
+    Raises:
+        UsageError: no motion has that name, or an option is unknown or out of range.
+    """
+    module = plugins.load(__name__, str(settings.get("name", "")))
+    options = {key: value for key, value in settings.items() if key != "name"}
+    motion: Motion = module.start(
+        strict.build(module.Options, options, "motion"), facts, generator
+    )
+    return motion

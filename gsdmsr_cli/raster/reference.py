@@ -105,14 +105,16 @@ def project(splats: Splats, camera: Camera) -> Projection:
 def _drawn(splats: Splats, camera: Camera) -> tuple[Tensor, Tensor]:
     """Return the rows that are drawn, (M,) from front to back, and all radii, (N,) [px].
 
-    A splat is drawn if all its stored values are finite, it is in front of the near plane, its
-    screen covariance is positive definite and the box around the ellipse where its alpha is at
-    least ALPHA_MIN touches the image. The radius is the larger half side of that box.
+    A splat is drawn if all its stored values are finite, it is in front of the near plane, the
+    determinant of its screen covariance is finite and positive, and the box around the ellipse
+    where its alpha is at least ALPHA_MIN touches the image. The radius is the larger half side of
+    that box.
     """
     seen = project(splats, camera)
-    keep = (seen.depths > NEAR) & (seen.opacities >= ALPHA_MIN) & (_det(seen.covs2d) > 0)
-    for tensor in (*splats.tensors().values(), seen.covs2d):
-        keep &= tensor.isfinite().flatten(1).all(-1) if tensor.dim() > 1 else tensor.isfinite()
+    det = _det(seen.covs2d)
+    keep = (seen.depths > NEAR) & (seen.opacities >= ALPHA_MIN) & (det > 0) & det.isfinite()
+    for tensor in splats.tensors().values():
+        keep &= tensor.isfinite().unsqueeze(-1).flatten(1).all(-1)
     mahalanobis2 = 2 * (seen.opacities / ALPHA_MIN).log()
     variances = seen.covs2d.diagonal(dim1=-2, dim2=-1)
     half_sides = (mahalanobis2.unsqueeze(-1) * variances).sqrt()

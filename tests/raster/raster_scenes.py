@@ -143,6 +143,22 @@ def poisoned() -> tuple[Case, Case, Tensor]:
     return sick, replace(sick, splats=some.take(finite)), finite
 
 
+def overflowing() -> Case:
+    """Finite values whose squares, exponentials or quotients are not finite in float32."""
+    some = splats(32, seed=19)
+    some.means[0] *= 1e30
+    some.means[1] *= -1e30
+    some.means[2] = float(torch.finfo().max)
+    for row, size in enumerate((20.0, 30.0, 50.0, 100.0, 1e30, -100.0, -1e30)):
+        some.log_scales[3 + row] = size
+    some.log_scales[10, 0] = 30.0
+    for row, size in enumerate((1e-30, 1e-15, 1e-12, 1e15, 1e30)):
+        some.quats[11 + row] *= size
+    some.logit_opacities[16], some.logit_opacities[17] = 1e30, -1e30
+    some.sh[18] = 1e30
+    return _case(20, 18, some)
+
+
 CASES: dict[str, Callable[[], Case]] = {
     "1x1": lambda: _case(1, 1, splats(12, size=0.4, logit=(-1.0, 1.0))),
     "16x16": lambda: _case(16, 16, splats(60)),

@@ -7,7 +7,17 @@ from functools import cache
 
 import pytest
 import torch
-from raster_scenes import CASES, Case, Drawing, ambiguous, case, draw, pixel_weights, poisoned
+from raster_scenes import (
+    CASES,
+    Case,
+    Drawing,
+    ambiguous,
+    case,
+    draw,
+    overflowing,
+    pixel_weights,
+    poisoned,
+)
 from torch import Tensor
 
 from gsdmsr_cli.raster import Engine, engine_names, load_engine, reference
@@ -130,6 +140,16 @@ def test_rows_that_are_not_finite_are_as_if_absent(placed: Placed) -> None:
     for name, gradient in found.gradients.items():
         assert not gradient[absent].any(), name
         torch.testing.assert_close(gradient[finite], expected.gradients[name])
+
+
+def test_values_that_overflow_spoil_neither_picture_nor_gradients(placed: Placed) -> None:
+    scene = overflowing()
+    found = draw(placed[0], scene, torch.ones(18, 20, 5), placed[1], torch.float32)
+    for image in vars(found.frame).values():
+        assert image.isfinite().all()
+    for name, gradient in found.gradients.items():
+        assert gradient.isfinite().all(), name
+    assert (found.frame.radii > 0).sum() > 10
 
 
 def test_zero_splats_give_the_background(placed: Placed) -> None:

@@ -1,0 +1,64 @@
+"""gsdmsr demo: makes a small moving scene, reconstructs it and says where to look."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from rich.console import Console
+from rich.progress import Progress
+
+from gsdmsr_cli.commands import eval as evaluate
+from gsdmsr_cli.commands import render, train
+from gsdmsr_cli.errors import UsageError
+from gsdmsr_cli.synthetic import write_scene
+
+BUDGET = "60s"
+"""Wall time of the training; with everything else the demo stays under 3 minutes on 2 cores."""
+
+MARKER = ".gsdmsr-demo"
+"""File that marks a folder as an earlier demo, which may be made anew."""
+
+
+def run(out: Path) -> None:
+    """Write the scene to ``out/scene`` and its reconstruction to ``out/run``.
+
+    Raises:
+        UsageError: ``out`` is a file, or a folder with something else in it.
+    """
+    console = Console()
+    _claim(out)
+    scene, run_folder = out / "scene", out / "run"
+    _write_scene(scene, console)
+    overrides = [f"training.budget={BUDGET}"]
+    train.run(scene, run_folder, "dnerf", None, overrides, "auto", False, run_folder.exists())
+    evaluate.run(run_folder, "test", None, None, None, False, [])
+    render.run(run_folder, None, None, None)
+    console.print(_where_to_look(scene, run_folder), soft_wrap=True, markup=False, highlight=False)
+
+
+def _claim(out: Path) -> None:
+    """Make ``out`` a demo's folder, unless something else lies there."""
+    if out.exists() and not out.is_dir():
+        raise UsageError(f"{out}: is a file; --out names a folder")
+    if out.is_dir() and any(out.iterdir()) and not (out / MARKER).is_file():
+        raise UsageError(f"{out}: is neither empty nor an earlier demo; choose another --out")
+    out.mkdir(parents=True, exist_ok=True)
+    (out / MARKER).touch()
+
+
+def _write_scene(folder: Path, console: Console) -> None:
+    with Progress(console=console, transient=True) as progress:
+        task = progress.add_task("drawing the scene", total=None)
+        write_scene(
+            folder,
+            progress=lambda done, total: progress.update(task, completed=done, total=total),
+        )
+
+
+def _where_to_look(scene: Path, run_folder: Path) -> str:
+    places = [("the pictures it learnt from", scene / "train")]
+    places += [("video", path) for path in sorted(run_folder.rglob("*.webm"))]
+    places += [("scores", run_folder / "eval" / "metrics.json")]
+    lines = [f"  {what}: {path}" for what, path in places]
+    export = f"gsdmsr export {run_folder} --format ply --time 0.5 --out half.ply"
+    return "\n".join(["Where to look", *lines, f"  for a splat viewer: {export}"])

@@ -1,0 +1,124 @@
+"""gsdmsr doctor: what this machine offers, and why what is missing is missing."""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import shutil
+from importlib import metadata
+from typing import Any
+
+import llvmlite.binding as llvm
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from gsdmsr_cli import __version__, plugins, preset_files, raster
+from gsdmsr_cli.errors import GsdmsrError
+from gsdmsr_cli.evaluation.lpips import NETS, Missing, load_lpips
+
+_PACKAGES = (
+    "torch",
+    "numba",
+    "llvmlite",
+    "numpy",
+    "opencv-contrib-python-headless",
+    "OpenImageIO",
+    "pycolmap",
+    "safetensors",
+    "PyYAML",
+    "typer",
+    "rich",
+)
+_SIMD = ("sse4.2", "avx", "avx2", "fma", "avx512f", "neon", "sve")
+_DEVICES = ("cpu", "cuda")
+
+
+def run(as_json: bool) -> None:
+    """Print the report as a table, or as one JSON object."""
+    report = examine()
+    if as_json:
+        Console().out(json.dumps(report, indent=2), highlight=False)
+    else:
+        Console().print(_table(report))
+
+
+def examine() -> dict[str, Any]:
+    """Return the report, fit for JSON; what is unavailable has a reason, what works has null."""
+    return {
+        "gsdmsr": __version__,
+        "python": platform.python_version(),
+        "platform": f"{platform.system()} {platform.release()} {platform.machine()}",
+        "cpu": {"name": llvm.get_host_cpu_name(), "cores": _cores(), "simd": _simd()},
+        "packages": {name: _version(name) for name in _PACKAGES},
+        "engines": {name: _engine(name) for name in raster.engine_names()},
+        "lpips": {net: _lpips(net) for net in NETS},
+        "plugins": {
+            kind: plugins.names(f"gsdmsr_cli.{kind}") for kind in ("motion", "formats", "exports")
+        },
+        "presets": preset_files.preset_names(),
+        "ffmpeg": shutil.which("ffmpeg"),
+    }
+
+
+def _cores() -> int:
+    """Return the number of cores this process may use, not of all there are."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def _simd() -> list[str]:
+    features = llvm.get_host_cpu_features()
+    return [name for name in _SIMD if features.get(name)]
+
+
+def _version(package: str) -> str | None:
+    try:
+        return metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return None
+
+
+def _engine(name: str) -> dict[str, str | None]:
+    """Return per device why the engine cannot draw on it, or None where it can."""
+    try:
+        engine = raster.load_engine(name)
+    except ImportError as error:
+        return dict.fromkeys(_DEVICES, f"cannot be imported: {error}")
+    return {device: engine.unavailable(device) for device in _DEVICES}
+
+
+def _lpips(net: str) -> str | None:
+    """Return why LPIPS on ``net`` cannot be computed, or None where its weights load."""
+    try:
+        found = load_lpips(net)
+    except GsdmsrError as error:
+        return str(error)
+    return found.reason if isinstance(found, Missing) else None
+
+
+def _table(report: dict[str, Any]) -> Table:
+    table = Table("what", "found", title=f"gsdmsr {report['gsdmsr']}")
+    cpu = report["cpu"]
+    table.add_row("python", f"{report['python']} on {report['platform']}")
+    table.add_row(
+        "cpu", f"{cpu['name']}, {cpu['cores']} cores, {' '.join(cpu['simd']) or 'no SIMD'}"
+    )
+    for name, version in report["packages"].items():
+        table.add_row(name, version or "[red]missing[/]; pip install gsdmsr brings it")
+    for name, devices in report["engines"].items():
+        for device, reason in devices.items():
+            table.add_row(f"engine {name} on {device}", _verdict(reason))
+    for net, reason in report["lpips"].items():
+        table.add_row(f"lpips_{net}", _verdict(reason))
+    for kind, names in report["plugins"].items():
+        table.add_row(kind, ", ".join(names) or "none")
+    table.add_row("presets", ", ".join(report["presets"]))
+    table.add_row("ffmpeg", report["ffmpeg"] or "not on the path; OpenCV's own is used")
+    return table
+
+
+def _verdict(reason: str | None) -> str:
+    return "[green]ok[/]" if reason is None else f"[yellow]no[/]: {escape(reason)}"

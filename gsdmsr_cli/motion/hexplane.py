@@ -1,0 +1,83 @@
+"""4D-GS (Wu et al., CVPR 2024): a HexPlane over space and time, decoded by a small network."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from gsdmsr_cli.fields import network, planes
+from gsdmsr_cli.fields.deformation import OUTPUTS, displace, name_tensors, time_nodes, trained
+from gsdmsr_cli.motion import Facts
+from gsdmsr_cli.splats import Splats
+
+
+@dataclass(frozen=True)
+class Options:
+    """Settings of the field and its regularisers.
+
+    Attributes:
+        levels: spatial nodes of each level along an axis.
+        channels: features per level, a multiple of 16.
+        time_ratio: nodes in time per distinct train time.
+        width: width of the network's two hidden layers, a multiple of 16.
+        detach: keep the field's gradient from the canonical positions.
+        space_smoothness, time_smoothness, time_stillness: weights of the plane regularisers.
+    """
+
+    levels: tuple[int, ...] = (64, 128)
+    channels: int = 32
+    time_ratio: float = 0.25
+    width: int = 64
+    detach: bool = False
+    space_smoothness: float = 1e-4
+    time_smoothness: float = 1e-2
+    time_stillness: float = 1e-4
+
+
+class HexPlaneMotion:
+    """x, q and log s plus offsets read from one grid of several levels (4D-GS, section 4)."""
+
+    def __init__(self, options: Options, facts: Facts, generator: torch.Generator) -> None:
+        self.options, self.bound = options, facts.bound
+        times = time_nodes(facts.frames, options.time_ratio)
+        self.levels = [
+            trained(planes.new_level(resolution, times, options.channels, generator))
+            for resolution in options.levels
+        ]
+        features = options.channels * len(options.levels)
+        widths = [features, options.width, options.width, OUTPUTS]
+        self.layers = [trained(layer) for layer in network.new_network(widths, generator)]
+
+    def at(self, splats: Splats, time: float) -> Splats:
+        """Return the deformed splats; time is mapped to the whole grid, [-1, 1]."""
+        points = splats.means / self.bound
+        if self.options.detach:
+            points = points.detach()
+        features = planes.lookup(self.levels, points, 2 * time - 1)
+        return displace(splats, network.apply_network(self.layers, features))
+
+    def take(self, rows: Tensor) -> None:
+        """Hold nothing per splat."""
+
+    def advance(self, progress: float) -> None:
+        """Have no phases."""
+
+    def penalty(self) -> Tensor | None:
+        """Return the plane regularisers."""
+        o = self.options
+        return planes.penalty(self.levels, o.space_smoothness, o.time_smoothness, o.time_stillness)
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Return the grid and the network."""
+        return name_tensors({"grid": self.levels}, {"network": self.layers})
+
+    def groups(self) -> dict[str, str]:
+        """Return which learning rate each tensor follows."""
+        return {n: "planes" if n.startswith("grid") else "network" for n in self.tensors()}
+
+
+def start(options: Options, facts: Facts, generator: torch.Generator) -> HexPlaneMotion:
+    """Return a motion that is the identity until its network's last layer has learnt."""
+    return HexPlaneMotion(options, facts, generator)

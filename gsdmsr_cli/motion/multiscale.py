@@ -1,0 +1,136 @@
+"""GS-DMSR (Lu et al. 2026): a coarse explicit field plus a fine implicit decoder.
+
+The coarse field moves positions only, through a linear decoder; the fine one moves positions,
+rotations and scales through a network with a shared trunk, which also sees the coarse features
+(the cross-scale pyramid). Both start as zero, so the motion starts as the identity.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from gsdmsr_cli.fields import network, planes
+from gsdmsr_cli.fields.deformation import OUTPUTS, displace, name_tensors, time_nodes, trained
+from gsdmsr_cli.motion import Facts
+from gsdmsr_cli.splats import Splats
+
+
+@dataclass(frozen=True)
+class Options:
+    """Settings of both fields and their regularisers.
+
+    Attributes:
+        coarse_level: spatial nodes of the coarse grid along an axis.
+        coarse_channels: features of the coarse grid, a multiple of 16.
+        coarse_time_ratio: the coarse grid's nodes in time per distinct train time.
+        coarse_until: progress up to which only the coarse field moves splats (the method's N1).
+        levels: spatial nodes of each level of the fine grid along an axis.
+        channels: features per level of the fine grid, a multiple of 16.
+        time_ratio: the fine grid's nodes in time per distinct train time.
+        width: width of the decoder's two hidden layers, a multiple of 16.
+        pyramid: give the coarse features to the fine decoder as well.
+        detach: keep the fields' gradient from the canonical positions.
+        offset_weight: weight of the mean squared coarse offset, in units of the bound.
+        space_smoothness, time_smoothness, time_stillness: weights of the plane regularisers.
+    """
+
+    coarse_level: int = 32
+    coarse_channels: int = 16
+    coarse_time_ratio: float = 0.125
+    coarse_until: float = 0.1
+    levels: tuple[int, ...] = (64, 128)
+    channels: int = 32
+    time_ratio: float = 0.25
+    width: int = 64
+    pyramid: bool = True
+    detach: bool = False
+    offset_weight: float = 1e-3
+    space_smoothness: float = 1e-4
+    time_smoothness: float = 1e-2
+    time_stillness: float = 1e-4
+
+
+class MultiscaleMotion:
+    """x + coarse + fine offset, q + fine offset, log s + fine offset (the method's section 3)."""
+
+    def __init__(self, options: Options, facts: Facts, generator: torch.Generator) -> None:
+        self.options, self.bound = options, facts.bound
+        self.fine_active = False
+        coarse_times = time_nodes(facts.frames, options.coarse_time_ratio)
+        self.coarse = [
+            trained(
+                planes.new_level(
+                    options.coarse_level, coarse_times, options.coarse_channels, generator
+                )
+            )
+        ]
+        self.coarse_decoder = [
+            trained(layer) for layer in network.new_network([options.coarse_channels, 3], generator)
+        ]
+        times = time_nodes(facts.frames, options.time_ratio)
+        self.fine = [
+            trained(planes.new_level(resolution, times, options.channels, generator))
+            for resolution in options.levels
+        ]
+        features = options.channels * len(options.levels)
+        features += options.coarse_channels if options.pyramid else 0
+        widths = [features, options.width, options.width, OUTPUTS]
+        self.decoder = [trained(layer) for layer in network.new_network(widths, generator)]
+        self._offset: Tensor | None = None
+
+    def at(self, splats: Splats, time: float) -> Splats:
+        """Return the deformed splats; time is mapped to the whole grids, [-1, 1]."""
+        points = splats.means / self.bound
+        if self.options.detach:
+            points = points.detach()
+        when = 2 * time - 1
+        features = planes.lookup(self.coarse, points, when)
+        offset = network.apply_network(self.coarse_decoder, features)
+        self._offset = offset
+        if self.fine_active:
+            fine = planes.lookup(self.fine, points, when)
+            seen = torch.cat([features, fine], dim=1) if self.options.pyramid else fine
+            deformation = network.apply_network(self.decoder, seen)
+            return displace(splats, deformation + _widened(offset))
+        return displace(splats, _widened(offset))
+
+    def take(self, rows: Tensor) -> None:
+        """Hold nothing per splat."""
+
+    def advance(self, progress: float) -> None:
+        """Let the fine field join after ``coarse_until``."""
+        self.fine_active = progress >= self.options.coarse_until
+
+    def penalty(self) -> Tensor | None:
+        """Return the plane regularisers of the active grids, and L_reg of the last ``at``."""
+        o = self.options
+        levels = self.coarse + (self.fine if self.fine_active else [])
+        value = planes.penalty(levels, o.space_smoothness, o.time_smoothness, o.time_stillness)
+        if self._offset is not None and o.offset_weight > 0:
+            energy = (self._offset / self.bound).square().sum(dim=1).mean()
+            value = value + o.offset_weight * energy
+        return value
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Return both grids and both decoders."""
+        return name_tensors(
+            {"coarse": self.coarse, "fine": self.fine},
+            {"coarse_decoder": self.coarse_decoder, "decoder": self.decoder},
+        )
+
+    def groups(self) -> dict[str, str]:
+        """Return which learning rate each tensor follows."""
+        return {n: "network" if "decoder" in n else "planes" for n in self.tensors()}
+
+
+def _widened(offset: Tensor) -> Tensor:
+    """Return an offset of the mean (N, 3) as a deformation (N, 10)."""
+    return torch.nn.functional.pad(offset, (0, OUTPUTS - offset.shape[1]))
+
+
+def start(options: Options, facts: Facts, generator: torch.Generator) -> MultiscaleMotion:
+    """Return a motion that is the identity until its decoders' last layers have learnt."""
+    return MultiscaleMotion(options, facts, generator)

@@ -1,0 +1,57 @@
+"""Progress of a training and what follows from it: a preset serves steps and minutes alike."""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import dataclass, field
+
+from gsdmsr_cli.preset import TrainingOptions, parse_duration
+
+
+def log_linear(ends: tuple[float, float], progress: float) -> float:
+    """Return the value between ``ends`` that is log-linear in progress, clamped to [0, 1]."""
+    p = min(max(progress, 0.0), 1.0)
+    return math.exp(math.log(ends[0]) * (1 - p) + math.log(ends[1]) * p)
+
+
+@dataclass
+class Clock:
+    """Counts steps and the wall time of training; a budget counts time, else steps do.
+
+    Attributes:
+        steps: length of the training [steps].
+        budget: length of the training [s], or None.
+        step: steps made.
+        before: wall time of earlier sessions [s].
+    """
+
+    steps: int
+    budget: float | None
+    step: int = 0
+    before: float = 0.0
+    _started: float | None = field(default=None, repr=False)
+
+    def start(self) -> None:
+        """Let the time of this session begin."""
+        self._started = time.perf_counter()
+
+    @property
+    def elapsed(self) -> float:
+        """Wall time of training, over all sessions [s]."""
+        if self._started is None:
+            return self.before
+        return self.before + time.perf_counter() - self._started
+
+    @property
+    def progress(self) -> float:
+        """How far the training is, in [0, 1]."""
+        if self.budget is not None:
+            return min(self.elapsed / self.budget, 1.0)
+        return min(self.step / self.steps, 1.0)
+
+
+def new_clock(options: TrainingOptions) -> Clock:
+    """Return the clock of a training that has not begun."""
+    budget = None if options.budget is None else parse_duration(options.budget)
+    return Clock(options.steps, budget)

@@ -1,0 +1,220 @@
+"""One training: its state, and what a step does with it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from gsdmsr_cli.errors import GsdmsrError
+from gsdmsr_cli.frame import Frame
+from gsdmsr_cli.model import MOVED_BY, STORED_AS, Model, load_model
+from gsdmsr_cli.motion import Facts, start_motion
+from gsdmsr_cli.pictures import Pictures
+from gsdmsr_cli.preset import Preset
+from gsdmsr_cli.raster import Engine
+from gsdmsr_cli.run import Checkpoint
+from gsdmsr_cli.scene import Scene, View
+from gsdmsr_cli.splatting import draw
+from gsdmsr_cli.training.density import DensityStatistics, grow_and_prune, reset_opacities
+from gsdmsr_cli.training.initial import initial_splats
+from gsdmsr_cli.training.losses import photometric_loss
+from gsdmsr_cli.training.optimizer import Adam
+from gsdmsr_cli.training.schedule import log_linear, new_clock
+
+PENALTY_EVERY = 4
+"""Regularisers are slow to change and cost a pass over all planes: every 4th step, 4 times."""
+
+PRUNE_EVERY = 500
+"""Interval of pruning alone, once growing has ended [steps]."""
+
+PATIENCE = 20
+"""Consecutive steps without a finite loss after which training gives up."""
+
+BACKGROUNDS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
+
+_SPLAT_NAMES = [STORED_AS + n for n in ("means", "quats", "log_scales", "logit_opacities", "sh")]
+_FIRST, _SECOND, _SEEN = "adam.first.", "adam.second.", "density."
+
+
+@dataclass(frozen=True)
+class Step:
+    """What one step did: the loss, or NaN if the step was skipped."""
+
+    loss: float
+
+
+class Trainer:
+    """A model in training on the train views of a scene.
+
+    Attributes:
+        model: what is trained.
+        clock: steps, time and progress.
+    """
+
+    def __init__(self, scene: Scene, preset: Preset, engine: Engine, pictures: Pictures) -> None:
+        self.scene, self.preset, self.engine, self.pictures = scene, preset, engine, pictures
+        self.views = scene.split("train")
+        self.radius = scene.radius
+        self.generator = torch.Generator().manual_seed(preset.training.seed)
+        self.facts = facts_of(scene)
+        self.model = Model(
+            initial_splats(scene, preset.splats, self.generator),
+            start_motion(preset.motion, self.facts, self.generator),
+        )
+        self.optimizer = Adam()
+        self.statistics = DensityStatistics(len(self.model.splats))
+        self.background = torch.tensor(BACKGROUNDS[preset.data.background])
+        self.clock = new_clock(preset.training)
+        self._queue: list[int] = []
+        self._resets = 0
+        self._moving = False
+        self._skipped = 0
+
+    def step(self) -> Step:
+        """Choose views, draw, compare, learn, grow and prune."""
+        progress = self.clock.progress
+        self._enter_phase(progress)
+        count = self.preset.training.views_per_step
+        drawn = [self._compare(self._next_view(), progress) for _ in range(count)]
+        loss = torch.stack([part for part, _ in drawn]).mean()
+        self._with_penalty(loss).backward()
+        value = float(loss.detach())
+        self.clock.step += 1
+        if not math.isfinite(value):
+            return self._skip()
+        self._skipped = 0
+        for _, frame in drawn:
+            self.statistics.observe(frame)
+        self.optimizer.step(self.model.tensors(), self._rates(progress))
+        self._control_density(progress)
+        return Step(value)
+
+    def _compare(self, view: View, progress: float) -> tuple[Tensor, Frame]:
+        camera = self.pictures.camera(view)
+        time = view.time if self._moving else None
+        degree = self._sh_degree(progress)
+        frame = draw(self.model, camera, time, self.engine, self.background, degree)
+        frame.means2d.retain_grad()
+        target = self.pictures.load(view)
+        return photometric_loss(frame.rgb, target, self.preset.losses.ssim), frame
+
+    def _with_penalty(self, loss: Tensor) -> Tensor:
+        if not self._moving or self.clock.step % PENALTY_EVERY:
+            return loss
+        penalty = self.model.motion.penalty()
+        return loss if penalty is None else loss + PENALTY_EVERY * penalty
+
+    def _next_view(self) -> View:
+        """Return the next view of a random order that visits every view before any again."""
+        if not self._queue:
+            self._queue = torch.randperm(len(self.views), generator=self.generator).tolist()
+        return self.views[self._queue.pop()]
+
+    def _sh_degree(self, progress: float) -> int:
+        """Return the degree of colour; degree d joins at d times ``sh_start``."""
+        options = self.preset.splats
+        if options.sh_start <= 0:
+            return options.sh_degree
+        return min(options.sh_degree, int(progress / options.sh_start))
+
+    def _enter_phase(self, progress: float) -> None:
+        """Start the motion after the static phase, without the momentum of what did not move."""
+        if not self._moving and progress >= self.preset.training.static_until:
+            self._moving = True
+            for name in _SPLAT_NAMES:
+                self.optimizer.forget(name, second=False)
+        self.model.motion.advance(progress)
+
+    def _rates(self, progress: float) -> dict[str, float]:
+        """Return each tensor's learning rate; schedules begin when the motion does."""
+        options = self.preset.optimizer
+        static = self.preset.training.static_until
+        p = (progress - static) / (1 - static) if static < 1 else 0.0
+        rates = {
+            STORED_AS + name: log_linear(getattr(options, name), p)
+            for name in self.model.splats.tensors()
+        }
+        rates[STORED_AS + "means"] *= self.radius
+        groups = {g: log_linear(getattr(options, g), p) for g in ("planes", "network")}
+        for name, group in self.model.motion.groups().items():
+            rates[MOVED_BY + name] = groups[group]
+        return rates
+
+    def _control_density(self, progress: float) -> None:
+        options, step = self.preset.density, self.clock.step
+        growing = progress < options.until
+        if step >= options.start and step % (options.every if growing else PRUNE_EVERY) == 0:
+            rows, fresh, grown = grow_and_prune(
+                self.model.splats, self.statistics, options, self.radius, growing, self.generator
+            )
+            if not len(rows):
+                raise GsdmsrError(
+                    f"no splats are left at step {step}; lower density.prune_opacity or check "
+                    "that cameras and pictures belong together"
+                )
+            self.model.take(rows)
+            with torch.no_grad():
+                for name, tensor in self.model.splats.tensors().items():
+                    tensor.copy_(getattr(grown, name))
+            self.optimizer.take(_SPLAT_NAMES, rows, fresh)
+            self.statistics = DensityStatistics(len(rows))
+        if self._resets < len(options.reset_at) and progress >= options.reset_at[self._resets]:
+            self._resets += 1
+            reset_opacities(self.model.splats)
+            self.optimizer.forget(STORED_AS + "logit_opacities")
+
+    def _skip(self) -> Step:
+        """Drop a step whose loss is not finite; give up after many in a row."""
+        self._skipped += 1
+        for tensor in self.model.tensors().values():
+            tensor.grad = None
+        if self._skipped >= PATIENCE:
+            raise GsdmsrError(
+                f"the loss is not finite for {PATIENCE} steps up to step {self.clock.step}; "
+                "the last checkpoint is kept; lower the learning rates with --set optimizer..."
+            )
+        return Step(math.nan)
+
+    def checkpoint(self) -> Checkpoint:
+        """Return everything needed to go on from here."""
+        tensors = dict(self.model.tensors())
+        tensors |= {_FIRST + name: t for name, t in self.optimizer.first.items()}
+        tensors |= {_SECOND + name: t for name, t in self.optimizer.second.items()}
+        tensors[_SEEN + "total"] = self.statistics.total
+        tensors[_SEEN + "views"] = self.statistics.views
+        tensors["generator"] = self.generator.get_state()
+        state = {
+            "queue": self._queue,
+            "resets": self._resets,
+            "moving": self._moving,
+            "adam_steps": self.optimizer.steps,
+        }
+        clock = self.clock
+        return Checkpoint(clock.step, clock.progress, clock.elapsed, tensors, state)
+
+    def restore(self, checkpoint: Checkpoint) -> None:
+        """Go on from a checkpoint of the same preset and scene."""
+        tensors, state = checkpoint.tensors, checkpoint.state
+        self.model = load_model(tensors, self.preset.motion, self.facts, checkpoint.progress)
+        for moments, prefix in ((self.optimizer.first, _FIRST), (self.optimizer.second, _SECOND)):
+            moments.update(
+                {n.removeprefix(prefix): t for n, t in tensors.items() if n.startswith(prefix)}
+            )
+        self.optimizer.steps = {name: int(count) for name, count in state["adam_steps"].items()}
+        self.statistics = DensityStatistics(len(self.model.splats))
+        self.statistics.total, self.statistics.views = (
+            tensors[_SEEN + "total"],
+            tensors[_SEEN + "views"],
+        )
+        self.generator.set_state(tensors["generator"])
+        self._queue, self._resets = list(state["queue"]), int(state["resets"])
+        self._moving = bool(state["moving"])
+        self.clock.step, self.clock.before = checkpoint.step, checkpoint.elapsed
+
+
+def facts_of(scene: Scene) -> Facts:
+    """Return what a motion may know of the scene."""
+    return Facts(bound=scene.bound, frames=len(scene.train_times))

@@ -1,0 +1,72 @@
+"""gsdmsr demo: what it runs, in which folder, and which folders it refuses."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from gsdmsr_cli.commands import demo
+from gsdmsr_cli.errors import UsageError
+from gsdmsr_cli.formats import dnerf
+from gsdmsr_cli.preset import load_preset, parse_duration
+from gsdmsr_cli.synthetic import write_scene
+
+Calls = list[tuple[str, tuple[Any, ...]]]
+
+
+@pytest.fixture
+def calls(monkeypatch: pytest.MonkeyPatch) -> Calls:
+    """A tiny scene, and commands that record their arguments instead of working."""
+    calls: Calls = []
+
+    def record(name: str, *arguments: Any) -> None:
+        calls.append((name, arguments))
+        if name == "train":
+            arguments[1].mkdir(exist_ok=True)
+        if name == "render":
+            (arguments[0] / "orbit.webm").touch()
+
+    for name, command in [("train", demo.train), ("eval", demo.evaluate), ("render", demo.render)]:
+        monkeypatch.setattr(command, "run", lambda *a, name=name: record(name, *a))
+    monkeypatch.setattr(
+        demo,
+        "write_scene",
+        lambda folder, progress: write_scene(folder, 16, 2, 1, 1, progress=progress),
+    )
+    return calls
+
+
+def test_it_makes_trains_evaluates_renders_and_tells(
+    tmp_path: Path, calls: Calls, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "new" / "demo"
+    demo.run(out)
+    assert len(dnerf.read(out / "scene").views) == 4
+    assert [name for name, _ in calls] == ["train", "eval", "render"]
+    data, run_folder, preset, config, overrides, device, resume, overwrite = calls[0][1]
+    assert (data, run_folder, device) == (out / "scene", out / "run", "auto")
+    assert (resume, overwrite) == (False, False)
+    budget = load_preset(preset, config, overrides).training.budget
+    assert budget is not None
+    assert parse_duration(budget) <= 90
+    told = capsys.readouterr().out
+    for path in (out / "scene" / "train", out / "run" / "orbit.webm", out / "run" / "eval"):
+        assert str(path) in told
+
+
+def test_an_earlier_demo_is_made_anew(tmp_path: Path, calls: Calls) -> None:
+    demo.run(tmp_path)
+    demo.run(tmp_path)
+    assert [arguments[-1] for name, arguments in calls if name == "train"] == [False, True]
+
+
+def test_a_folder_with_something_else_is_refused_and_left(tmp_path: Path, calls: Calls) -> None:
+    (tmp_path / "thesis.tex").write_text("years of work")
+    with pytest.raises(UsageError, match="neither empty nor an earlier demo"):
+        demo.run(tmp_path)
+    with pytest.raises(UsageError, match="is a file"):
+        demo.run(tmp_path / "thesis.tex")
+    assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
+    assert calls == []
