@@ -3,6 +3,7 @@
     RUN/run.json          preset, facts of the scene, where the data lay, versions
     RUN/metrics.jsonl     one line per report of the training
     RUN/checkpoint.safetensors   the last checkpoint, with its state as JSON in the header
+    RUN/training.json     how long the training took, on which machine
 
 Every file is written beside its place and then moved there, so an interrupted write leaves the
 earlier one. The folder can be moved; nothing in it is pickled.
@@ -14,7 +15,7 @@ import json
 import os
 import shutil
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +25,8 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from gsdmsr_cli import __version__, strict
-from gsdmsr_cli.errors import DataError
+from gsdmsr_cli.errors import DataError, UsageError
+from gsdmsr_cli.files import read_json, write_json
 from gsdmsr_cli.model import Model, load_model
 from gsdmsr_cli.motion import Facts
 from gsdmsr_cli.preset import Preset
@@ -32,6 +34,7 @@ from gsdmsr_cli.scene import Scene
 
 SCHEMA = 1
 _ABOUT, _LOG, _CHECKPOINT = "run.json", "metrics.jsonl", "checkpoint.safetensors"
+_TRAINING = "training.json"
 
 
 @dataclass(frozen=True)
@@ -59,16 +62,20 @@ class Run:
 
     Attributes:
         root: the folder.
+        name: of the preset, or of the file of options, that the training began from.
         preset: all options of the training.
         facts: what the motion was told of the scene.
         data: folder of the scene, absolute when the run was made.
+        layout: format of the scene.
         fingerprint: of the scene's layout files.
     """
 
     root: Path
+    name: str
     preset: Preset
     facts: Facts
     data: Path
+    layout: str
     fingerprint: str
 
     @property
@@ -81,10 +88,48 @@ class Run:
         """The last checkpoint."""
         return self.root / _CHECKPOINT
 
+    @property
+    def training_path(self) -> Path:
+        """How long the training took and what it ran on."""
+        return self.root / _TRAINING
+
+    def describe(self) -> None:
+        """Write what the run is, in place of what was said before."""
+        about = {
+            "schema": SCHEMA,
+            "gsdmsr": __version__,
+            "torch": torch.__version__,
+            "name": self.name,
+            "preset": strict.dump(self.preset),
+            "facts": asdict(self.facts),
+            "data": {
+                "path": str(self.data),
+                "layout": self.layout,
+                "fingerprint": self.fingerprint,
+            },
+        }
+        write_json(self.root / _ABOUT, about)
+
+    def check_scene(self, scene: Scene) -> None:
+        """Raise DataError unless the scene is the one that the run was trained on."""
+        if scene.fingerprint != self.fingerprint:
+            raise DataError(
+                f"{scene.root}: is not the data that {self.root} was trained on (its layout files "
+                "differ); give that folder with --data"
+            )
+
     def log(self, entry: Mapping[str, Any]) -> None:
         """Append one line to the log."""
         with self.log_path.open("a", encoding="utf-8") as file:
-            file.write(json.dumps(entry) + "\n")
+            file.write(json.dumps(entry, allow_nan=False) + "\n")
+
+    def rewind_log(self, step: int) -> None:
+        """Drop the lines of the log after ``step``, and one whose writing was interrupted."""
+        if not self.log_path.is_file():
+            return
+        lines = self.log_path.read_text(encoding="utf-8").splitlines(keepends=True)
+        kept = [line for line in lines if _is_up_to(step, line)]
+        self.log_path.write_text("".join(kept), encoding="utf-8")
 
     def save(self, checkpoint: Checkpoint) -> None:
         """Replace the last checkpoint."""
@@ -111,7 +156,9 @@ class Run:
             DataError: there is none, or it is damaged.
         """
         if not self.checkpoint_path.is_file():
-            raise DataError(f"{self.root}: the run has no checkpoint yet; train it first")
+            raise DataError(
+                f"{self.root}: the run has no checkpoint yet; train it again with --overwrite"
+            )
         try:
             with safe_open(self.checkpoint_path, framework="pt") as file:
                 state = json.loads((file.metadata() or {})["gsdmsr"])
@@ -137,44 +184,48 @@ class Run:
         return model, checkpoint
 
 
+def refuse_used(root: Path, overwrite: bool) -> None:
+    """Raise DataError unless a run may be started in the folder ``root``."""
+    if not root.exists() or (root.is_dir() and not any(root.iterdir())):
+        return
+    if not (root / _ABOUT).is_file():
+        raise DataError(f"{root}: exists and is not a run folder; choose another --out")
+    if not overwrite:
+        raise DataError(
+            f"{root}: holds a run; continue it with --resume or replace it with --overwrite"
+        )
+
+
 def create_run(
-    root: Path, preset: Preset, facts: Facts, scene: Scene, overwrite: bool = False
+    root: Path, name: str, preset: Preset, facts: Facts, scene: Scene, overwrite: bool = False
 ) -> Run:
-    """Start a run folder.
+    """Start a run folder; an earlier run there is deleted if ``overwrite`` says so.
 
     Raises:
         DataError: the folder is in use and ``overwrite`` is not set, or is not a run at all, or
-            cannot be written.
+            holds the scene, or cannot be written.
     """
-    if root.exists() and (not root.is_dir() or any(root.iterdir())):
-        if not (root / _ABOUT).is_file():
-            raise DataError(f"{root}: exists and is not a run folder; choose another --out")
-        if not overwrite:
-            raise DataError(
-                f"{root}: holds a run; continue it with --resume or replace it with --overwrite"
-            )
+    refuse_used(root, overwrite)
+    data = scene.root.resolve()
+    if data.is_relative_to(root.resolve()):
+        raise DataError(f"{root}: holds the data {scene.root}; choose another --out")
+    if root.exists():
         shutil.rmtree(root)
-    run = Run(root, preset, facts, scene.root.resolve(), scene.fingerprint)
-    about = {
-        "schema": SCHEMA,
-        "gsdmsr": __version__,
-        "torch": torch.__version__,
-        "preset": strict.dump(preset),
-        "facts": asdict(facts),
-        "data": {
-            "path": str(run.data),
-            "layout": scene.layout,
-            "fingerprint": scene.fingerprint,
-        },
-    }
-    try:
-        root.mkdir(parents=True, exist_ok=True)
-        beside = root / f"{_ABOUT}.part"
-        beside.write_text(json.dumps(about, indent=2) + "\n", encoding="utf-8")
-        os.replace(beside, root / _ABOUT)
-    except OSError as error:
-        raise DataError(f"{root}: cannot be written: {error.strerror}") from error
+    run = Run(root, name, preset, facts, data, scene.layout, scene.fingerprint)
+    run.describe()
     return run
+
+
+def continue_run(run: Run, preset: Preset, scene: Scene) -> Run:
+    """Return the run with other options, and with its scene at another place; both written down.
+
+    Raises:
+        DataError: the scene is not the run's, or the folder cannot be written.
+    """
+    run.check_scene(scene)
+    continued = replace(run, preset=preset, data=scene.root.resolve())
+    continued.describe()
+    return continued
 
 
 def open_run(root: Path) -> Run:
@@ -186,14 +237,25 @@ def open_run(root: Path) -> Run:
     path = root / _ABOUT
     if not path.is_file():
         raise DataError(f"{root}: not a run folder (no {_ABOUT}); give one that train wrote")
+    about = read_json(path)
+    if about.get("schema") != SCHEMA:
+        raise DataError(f"{path}: has schema {about.get('schema')}; this version reads {SCHEMA}")
     try:
-        about = json.loads(path.read_text(encoding="utf-8"))
         return Run(
             root,
+            str(about["name"]),
             strict.build(Preset, about["preset"], str(path)),
-            Facts(**about["facts"]),
+            strict.build(Facts, about["facts"], str(path)),
             Path(about["data"]["path"]),
+            str(about["data"]["layout"]),
             str(about["data"]["fingerprint"]),
         )
-    except (OSError, KeyError, TypeError, ValueError) as error:
+    except (UsageError, LookupError, TypeError, AttributeError) as error:
         raise DataError(f"{path}: damaged: {error}") from error
+
+
+def _is_up_to(step: int, line: str) -> bool:
+    try:
+        return bool(json.loads(line)["step"] <= step)
+    except (ValueError, LookupError, TypeError):
+        return False

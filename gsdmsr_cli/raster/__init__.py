@@ -74,3 +74,20 @@ def best_engine(device: str) -> Engine:
             return engine
         reasons.append(f"{name}: {reason}")
     raise UsageError(f"no engine can draw on device '{device}' ({'; '.join(reasons)})")
+
+
+def pick_device(wanted: str) -> str:
+    """Return where to compute, "cpu" or "cuda"; "auto" takes a CUDA engine if one can draw.
+
+    Raises:
+        UsageError: "cuda" is wanted and no CUDA engine can draw.
+    """
+    if wanted == "cpu":
+        return wanted
+    if "cuda" not in engine_names():
+        reason: str | None = "this version has no CUDA engine"
+    else:
+        reason = load_engine("cuda").unavailable("cuda")
+    if reason is not None and wanted == "cuda":
+        raise UsageError(f"--device cuda: {reason}; use --device cpu")
+    return "cpu" if reason is not None else "cuda"

@@ -12,7 +12,7 @@ from gsdmsr_cli.errors import GsdmsrError
 from gsdmsr_cli.frame import Frame
 from gsdmsr_cli.model import MOVED_BY, STORED_AS, Model, load_model
 from gsdmsr_cli.motion import Facts, start_motion
-from gsdmsr_cli.pictures import Pictures
+from gsdmsr_cli.pictures import HalvedPictures, Pictures
 from gsdmsr_cli.preset import Preset
 from gsdmsr_cli.raster import Engine
 from gsdmsr_cli.run import Checkpoint
@@ -56,6 +56,7 @@ class Trainer:
 
     def __init__(self, scene: Scene, preset: Preset, engine: Engine, pictures: Pictures) -> None:
         self.scene, self.preset, self.engine, self.pictures = scene, preset, engine, pictures
+        self.small_pictures = HalvedPictures(pictures)
         self.views = scene.split("train")
         self.radius = scene.radius
         self.generator = torch.Generator().manual_seed(preset.training.seed)
@@ -93,13 +94,15 @@ class Trainer:
         return Step(value)
 
     def _compare(self, view: View, progress: float) -> tuple[Tensor, Frame]:
-        camera = self.pictures.camera(view)
+        low = progress < self.preset.training.low_resolution_until
+        pictures = self.small_pictures if low else self.pictures
+        camera = pictures.camera(view)
         time = view.time if self._moving else None
         degree = self._sh_degree(progress)
         frame = draw(self.model, camera, time, self.engine, self.background, degree)
         frame.means2d.retain_grad()
-        target = self.pictures.load(view)
-        return photometric_loss(frame.rgb, target, self.preset.losses.ssim), frame
+        loss = photometric_loss(frame.rgb, pictures.load(view), self.preset.losses.ssim)
+        return loss, frame
 
     def _with_penalty(self, loss: Tensor) -> Tensor:
         if not self._moving or self.clock.step % PENALTY_EVERY:

@@ -1,0 +1,1 @@
+"""Measurements that anyone can repeat: of the kernels, in turns with a yardstick."""

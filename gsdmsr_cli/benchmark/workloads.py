@@ -1,0 +1,64 @@
+"""What is timed: drawing forward and backward, and a whole training step."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from gsdmsr_cli.benchmark.cloud import camera, cloud
+from gsdmsr_cli.model import Model
+from gsdmsr_cli.motion import Facts, start_motion
+from gsdmsr_cli.raster import best_engine
+from gsdmsr_cli.splatting import draw
+from gsdmsr_cli.training.losses import photometric_loss
+from gsdmsr_cli.training.optimizer import Adam
+
+TIME = 0.65
+FRAMES = 200
+SSIM_WEIGHT = 0.2
+NOISE = 0.05
+
+
+def target_of(rgb: Tensor) -> Tensor:
+    """Return an 8-bit target (3, H, W): the picture with noise, so that every pixel has a loss."""
+    noise = torch.randn(rgb.shape, generator=torch.Generator().manual_seed(0)) * NOISE
+    picture = (rgb.detach() + noise).clamp(0, 1)
+    return (picture * 255).to(torch.uint8).permute(2, 0, 1).contiguous()
+
+
+def drawing(size: int, count: int) -> Callable[[], None]:
+    """Return a function that draws degree-0 splats and takes the gradients of all stored values."""
+    splats = cloud(count).map(lambda t: t.requires_grad_(True))
+    engine, view, background = best_engine("cpu"), camera(size), torch.ones(3)
+    slope = torch.randn(3, size, size, generator=torch.Generator().manual_seed(0))
+
+    def run() -> None:
+        frame = engine.rasterize(splats, view, background)
+        frame.rgb.backward(slope.permute(1, 2, 0))  # type: ignore[no-untyped-call]
+        for tensor in splats.tensors().values():
+            tensor.grad = None
+
+    return run
+
+
+def training_step(size: int, count: int, motion: str) -> Callable[[], None]:
+    """Return a function that makes a training step at rate 0: L1 + SSIM, one view."""
+    model = Model(cloud(count), start_motion({"name": motion}, Facts(1.0, FRAMES), _generator()))
+    model.motion.advance(1.0)
+    engine, view, background = best_engine("cpu"), camera(size), torch.ones(3)
+    target = target_of(draw(model, view, TIME, engine, background).rgb)
+    optimizer, rates = Adam(), dict.fromkeys(model.tensors(), 0.0)
+
+    def run() -> None:
+        frame = draw(model, view, TIME, engine, background)
+        frame.means2d.retain_grad()
+        photometric_loss(frame.rgb, target, SSIM_WEIGHT).backward()  # type: ignore[no-untyped-call]
+        optimizer.step(model.tensors(), rates)
+
+    return run
+
+
+def _generator() -> torch.Generator:
+    return torch.Generator().manual_seed(0)

@@ -1,0 +1,102 @@
+"""The small network: its start, the twin by gradcheck, the kernels against the twin."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import pytest
+import torch
+from kernel_checks import assert_near, assert_same_on_threads, generator, leaves
+from torch import Tensor
+
+from gsdmsr_cli.fields import network
+from gsdmsr_cli.fields.network import Layer
+
+WIDTHS = [[48, 64, 64, 10], [16, 3], [32, 16, 16], [16, 80, 33]]
+
+
+def tensors_of(widths: list[int], seed: int = 0) -> list[Tensor]:
+    """Return weight and bias of each layer, all random."""
+    rng, tensors = generator(seed), []
+    for inputs, outputs in pairwise(widths):
+        tensors.append(torch.randn(inputs, outputs, generator=rng) / inputs**0.5)
+        tensors.append(torch.randn(outputs, generator=rng) * 0.3)
+    return tensors
+
+
+def layers_of(tensors: list[Tensor]) -> list[Layer]:
+    return [Layer(*pair) for pair in zip(tensors[::2], tensors[1::2], strict=True)]
+
+
+def test_twin_passes_gradcheck() -> None:
+    x = torch.randn(4, 6, generator=generator(1), dtype=torch.float64, requires_grad=True)
+    tensors = leaves(tensors_of([6, 7, 5, 3]), torch.float64)
+
+    def apply(x: Tensor, *tensors: Tensor) -> Tensor:
+        return network.apply_network_twin(layers_of(list(tensors)), x)
+
+    assert torch.autograd.gradcheck(apply, (x, *tensors))
+
+
+@pytest.mark.parametrize("count", [0, 1, 3, 5, 333])
+@pytest.mark.parametrize("widths", WIDTHS, ids=str)
+def test_kernels_match_the_twin(widths: list[int], count: int) -> None:
+    start = [torch.randn(count, widths[0], generator=generator(2)), *tensors_of(widths)]
+    ours, exact = leaves(start, torch.float32), leaves(start, torch.float64)
+    found = network.apply_network(layers_of(ours[1:]), ours[0])
+    truth = network.apply_network_twin(layers_of(exact[1:]), exact[0])
+    assert found.shape == (count, widths[-1])
+    assert_near(found, truth, 1e-5, "output")
+    weights = torch.randn(found.shape, generator=generator(3))
+    (found * weights).sum().backward()
+    (truth * weights).sum().backward()
+    for i, (a, b) in enumerate(zip(ours, exact, strict=True)):
+        assert_near(a.grad, b.grad, 1e-4, f"gradient {i}")
+
+
+def test_inputs_need_not_be_contiguous_nor_want_a_gradient() -> None:
+    x = torch.randn(32, 7, generator=generator(4)).T
+    start = tensors_of([32, 16, 5])
+    ours, exact = leaves(start, torch.float32), leaves(start, torch.float64)
+    found = network.apply_network(layers_of(ours), x)
+    truth = network.apply_network_twin(layers_of(exact), x.double())
+    assert_near(found, truth, 1e-5, "output")
+    found.sum().backward()
+    truth.sum().backward()
+    for a, b in zip(ours, exact, strict=True):
+        assert_near(a.grad, b.grad, 1e-5, "gradient")
+
+
+def test_a_new_network_is_zero_and_its_last_layer_can_learn() -> None:
+    layers = network.new_network([48, 64, 10], generator())
+    x = torch.randn(9, 48, generator=generator(5))
+    weight = layers[-1].weight.requires_grad_()
+    y = network.apply_network(layers, x)
+    assert y.shape == (9, 10) and not y.any()
+    y.sum().backward()
+    assert weight.grad is not None and weight.grad.any()
+
+
+def test_hidden_weights_have_the_variance_of_he() -> None:
+    hidden = network.new_network([128, 256, 10], generator())[0]
+    assert float(hidden.weight.var()) == pytest.approx(2 / 128, rel=0.05)
+    assert float(hidden.weight.mean()) == pytest.approx(0, abs=0.002)
+    assert not hidden.bias.any()
+
+
+def test_widths_that_kernels_cannot_serve_are_refused() -> None:
+    with pytest.raises(ValueError, match=r"\[48, 20\] are not all multiples of 16"):
+        network.new_network([48, 20, 10], generator())
+
+
+def test_results_do_not_depend_on_the_number_of_threads() -> None:
+    start = [torch.randn(333, 48, generator=generator(6)), *tensors_of([48, 64, 64, 10])]
+
+    def compute() -> list[Tensor]:
+        ours = leaves(start, torch.float32)
+        y = network.apply_network(layers_of(ours[1:]), ours[0])
+        y.square().sum().backward()
+        return [y, *(t.grad for t in ours if t.grad is not None)]
+
+    assert len(compute()) == 1 + 7
+    assert_same_on_threads(compute)
