@@ -27,6 +27,9 @@ benchmark_app = typer.Typer(help="Measure speed.", no_args_is_help=True)
 app.add_typer(benchmark_app, name="benchmark")
 
 RunFolder = Annotated[Path, typer.Argument(metavar="RUN", help="Folder that train wrote.")]
+MovedData = Annotated[
+    Path | None, typer.Option("--data", metavar="DIR", help="Where the data lies now, if moved.")
+]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object and nothing else.")]
 Background = Literal["white", "black"]
 
@@ -130,13 +133,15 @@ def evaluate(
     as_json: Json = False,
     fail_under: Annotated[
         list[str] | None,
-        typer.Option(metavar="METRIC=VALUE", help="Exit with 4 below it; repeatable."),
+        typer.Option(metavar="METRIC=VALUE", help="Exit with 4 if worse; repeatable."),
     ] = None,
+    data: MovedData = None,
 ) -> None:
     """Measure a run on views it has not seen."""
     from gsdmsr_cli.commands import eval as command
 
-    command.run(run_folder, split, background, downscale, lpips_weights, as_json, fail_under or [])
+    thresholds = fail_under or []
+    command.run(run_folder, split, background, downscale, lpips_weights, as_json, thresholds, data)
 
 
 @app.command()
@@ -147,11 +152,12 @@ def render(
     ] = None,
     frames: Annotated[int | None, typer.Option(min=1, help="Frames of the orbit.")] = None,
     out: Annotated[Path | None, typer.Option(metavar="DIR", help="Folder to write.")] = None,
+    data: MovedData = None,
 ) -> None:
     """Draw a run to pictures and a video."""
     from gsdmsr_cli.commands import render as command
 
-    command.run(run_folder, path, frames, out)
+    command.run(run_folder, path, frames, out, data)
 
 
 @app.command()

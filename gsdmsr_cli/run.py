@@ -176,9 +176,7 @@ class Run:
     def load_model(self) -> tuple[Model, Checkpoint]:
         """Read the model of the last checkpoint, for drawing."""
         checkpoint = self.load()
-        model = load_model(
-            checkpoint.tensors, self.preset.motion, self.facts, checkpoint.progress
-        )
+        model = load_model(checkpoint.tensors, self.preset.motion, self.facts, checkpoint.progress)
         for tensor in model.tensors().values():
             tensor.requires_grad_(False)
         return model, checkpoint

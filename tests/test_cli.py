@@ -92,18 +92,18 @@ def test_version(gsdmsr: Gsdmsr, capsys: pytest.CaptureFixture[str]) -> None:
             "train",
             (Path("d"), Path("r"), "dnerf", Path("f.yaml"), ["a.b=1", "a.c=2"], "cpu", True, False),
         ),
-        ("eval r", "eval", (Path("r"), "test", None, None, None, False, [])),
+        ("eval r", "eval", (Path("r"), "test", None, None, None, False, [], None)),
         (
             "eval r --split val --background black --downscale 2 --lpips-weights w --json"
-            " --fail-under psnr=25 --fail-under ssim=0.9",
+            " --fail-under psnr=25 --fail-under ssim=0.9 --data d",
             "eval",
-            (Path("r"), "val", "black", 2, Path("w"), True, ["psnr=25", "ssim=0.9"]),
+            (Path("r"), "val", "black", 2, Path("w"), True, ["psnr=25", "ssim=0.9"], Path("d")),
         ),
-        ("render r", "render", (Path("r"), None, None, None)),
+        ("render r", "render", (Path("r"), None, None, None, None)),
         (
-            "render r --path orbit --frames 9 --out o",
+            "render r --path orbit --frames 9 --out o --data d",
             "render",
-            (Path("r"), "orbit", 9, Path("o")),
+            (Path("r"), "orbit", 9, Path("o"), Path("d")),
         ),
         (
             "export r --format ply --time 0.5 --out o",

@@ -13,9 +13,11 @@ def export(model: MovingSplats, target: Path, options: ExportOptions) -> list[Pa
     """Write the splats at ``options.time`` to the file ``target``, replacing what was there.
 
     Raises:
-        UsageError: ``target`` does not end in .ply.
+        UsageError: ``target`` does not end in .ply, or several frames are asked for.
         DataError: a splat holds NaN or infinity, or the file cannot be written.
     """
+    if options.frames:
+        raise UsageError("--format ply shows one moment; give --time T, or take ply-sequence")
     if target.suffix.lower() != ".ply":
         raise UsageError(f"--format ply writes one file, but '{target}' does not end in .ply")
     write_ply(target, model.at(options.time))

@@ -30,7 +30,9 @@ def time_nodes(frames: int, cells_per_frame: float, least: int = 8) -> int:
     return max(round(frames * cells_per_frame), least)
 
 
-def name_tensors(levels: dict[str, list[Level]], layers: dict[str, list[Layer]]) -> dict[str, Tensor]:
+def name_tensors(
+    levels: dict[str, list[Level]], layers: dict[str, list[Layer]]
+) -> dict[str, Tensor]:
     """Return all tensors of grids and networks as "grid.0.space", "network.1.weight" and so on."""
     named: dict[str, Tensor] = {}
     for kind in (levels, layers):

@@ -186,9 +186,7 @@ class _Penalty(Function):
             d_space, d_time = torch.empty_like(space), torch.empty_like(time)
             sums = np.empty((2, 3 * space.shape[1]))
             kernels.space_penalty(array(space), space_weight, array(d_space), sums[0])
-            kernels.time_penalty(
-                array(time), smooth_weight, still_weight, array(d_time), sums[1]
-            )
+            kernels.time_penalty(array(time), smooth_weight, still_weight, array(d_time), sums[1])
             total += float(sums.sum())
             gradients += [d_space, d_time]
         ctx.gradients = gradients

@@ -27,21 +27,16 @@ class Bins(NamedTuple):
     """Which splats touch which tile.
 
     Attributes:
-        entries: (E, 3) int32 in tile order: splat, first | last << 8 row inside the tile, slot.
-            Slots number the same entries splat by splat, so that sums over a splat are contiguous.
+        entries: (E, 2) int32 in tile order: splat, first | last << 8 row inside the tile.
         starts: (tiles + 1,) int32, where each tile's entries start; tiles are row by row.
         busiest: (tiles,) int32, the tiles by falling number of entries.
         splats: (n,) int32, the drawn splats, front to back.
-        slots: (n, 2) int64, the first slot of each of ``splats`` and the one after its last.
-        slot_count: an upper bound of all slots.
     """
 
     entries: NDArray[np.int32]
     starts: NDArray[np.int32]
     busiest: NDArray[np.int32]
     splats: NDArray[np.int32]
-    slots: NDArray[np.int64]
-    slot_count: int
 
 
 def depth_order(depths: NDArray[np.float32], tiles: NDArray[np.int32]) -> NDArray[np.int32]:
@@ -76,8 +71,8 @@ def _rows_of_column(a, b, c, det, extent, reach, half_x, slope, low, high, centr
 
 @parallel
 def _list_tiles(
-    order, means2d, conics, opacities, width, height, chunks, bounds, pairs, slots, counts, listed,
-):  # fmt: skip
+    order, means2d, conics, opacities, width, height, chunks, bounds, pairs, counts, listed
+):
     """Append (splat, tile << 8 | rows) of every touched tile to the chunk's part of ``pairs``."""
     n = order.shape[0]
     columns = (width + TILE - 1) // TILE
@@ -86,7 +81,6 @@ def _list_tiles(
         at = bounds[n * chunk // chunks]
         for k in range(n * chunk // chunks, n * (chunk + 1) // chunks):
             i = order[k]
-            slots[k, 0] = at
             a, b, c = conics[i, 0], conics[i, 1], conics[i, 2]
             mx, my = means2d[i, 0], means2d[i, 1]
             extent = float32(2) * math.log(opacities[i] / _ALPHA_MIN)
@@ -97,9 +91,12 @@ def _list_tiles(
             for tx in range(left // TILE, right // TILE + 1):
                 low = float32(tx * TILE) + _HALF - mx - _ROUNDING
                 high = float32(tx * TILE + TILE) - _HALF - mx + _ROUNDING
-                top, bottom = _rows_of_column(
-                    a, b, c, det, extent, extent * c, half_x, slope, low, high, my, height
-                )
+                if left // TILE == right // TILE:  # one column holds the whole ellipse
+                    top, bottom = pixel_range(my, half_y, height)
+                else:
+                    top, bottom = _rows_of_column(
+                        a, b, c, det, extent, extent * c, half_x, slope, low, high, my, height
+                    )
                 if bottom < top:
                     continue
                 for ty in range(top // TILE, bottom // TILE + 1):
@@ -109,7 +106,6 @@ def _list_tiles(
                     pairs[at, 0] = i
                     pairs[at, 1] = tile << 8 | first << 4 | last
                     at += 1
-            slots[k, 1] = at
         listed[chunk] = at
 
 
@@ -138,7 +134,6 @@ def _scatter(pairs, order_size, chunks, bounds, listed, heads, entries):
             heads[chunk, tile] = at + 1
             entries[at, 0] = pairs[m, 0]
             entries[at, 1] = ((code >> 4) & 15) | ((code & 15) << 8)
-            entries[at, 2] = m
 
 
 def bin_splats(
@@ -157,16 +152,15 @@ def bin_splats(
     bounds = np.zeros(n + 1, np.int64)
     np.cumsum(tiles[order], out=bounds[1:])
     pairs = np.empty((max(int(bounds[-1]), 1), 2), np.int32)
-    slots = np.empty((n, 2), np.int64)
     counts = np.empty((chunks, tile_count), np.int32)
     listed = np.empty(chunks, np.int64)
     starts = np.empty(tile_count + 1, np.int32)
     _list_tiles(
-        order, means2d, conics, opacities, width, height, chunks, bounds, pairs, slots,
+        order, means2d, conics, opacities, width, height, chunks, bounds, pairs,
         counts, listed,
     )  # fmt: skip
     total = _scan(counts, starts)
-    entries = np.empty((total, 3), np.int32)
+    entries = np.empty((total, 2), np.int32)
     _scatter(pairs, n, chunks, bounds, listed, counts, entries)
     busiest = np.argsort(-np.diff(starts), kind="stable").astype(np.int32)
-    return Bins(entries, starts, busiest, order, slots, len(pairs))
+    return Bins(entries, starts, busiest, order)

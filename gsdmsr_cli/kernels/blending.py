@@ -22,8 +22,9 @@ from gsdmsr_cli.splatting_constants import ALPHA_MAX, ALPHA_MIN, TILE, TRANSMITT
 RECORD = 16
 """Floats per splat record: one cache line, of which nine are used."""
 
-SLOT = 12
-"""Floats per gradient slot, of which nine are used."""
+PARTS = 4
+"""Parts of the picture whose gradients are summed apart, and so the most threads of the backward
+pass. A fixed number: then the sums do not depend on how many threads there are."""
 
 _LOG2E = float32(math.log2(math.e))
 _ALPHA_MIN = float32(ALPHA_MIN)
@@ -131,34 +132,34 @@ def blend(records, entries, starts, busiest, lanes, columns, background, rgb, tr
 
 @parallel
 def blend_backward(
-    records, entries, starts, busiest, ends, lanes, columns, rgb, transmittance, d_rgb, d_alpha,
-    slots,
-):  # fmt: skip
-    """Write each entry's share of the gradients to its slot.
+    records, entries, starts, busiest, ends, columns, rgb, transmittance, d_rgb, d_alpha, sums
+):
+    """Sum every splat's share of the gradients over the pixels of each part of the picture.
 
-    With e = alpha dL/dalpha of a pixel, a slot holds the sums over the tile of e, e dx, e dy,
-    e dx^2, e dx dy, e dy^2 and of weight times d_rgb. Saturated pixels have e = 0.
+    With e = alpha dL/dalpha of a pixel, the sums are those of e, e dx, e dy, e dx^2, e dx dy,
+    e dy^2 and of weight times d_rgb. Saturated pixels have e = 0.
 
     Args:
         d_rgb: (3, H', W') float32. d_alpha: (H', W') float32. Both 0 outside the picture.
-        slots: (S, 12) float32 out; slots of entries that were not blended are set to 0.
+        sums: (PARTS, N, 16) float32 out, of which nine columns are used.
         others: see ``blend``.
     """
     stride = rgb.shape[2]
     plane = rgb.shape[1] * stride
     pixels, through = rgb.reshape(-1), transmittance.reshape(-1)
     d_pixels, d_cover = d_rgb.reshape(-1), d_alpha.reshape(-1)
-    for lane in prange(lanes):
+    for part in prange(PARTS):
+        own = sums[part].reshape(-1)
+        own[:] = float32(0)
         block = np.empty(5 * _BLOCK, np.float32)
         one, zero = simd.splat(float32(1)), simd.splat(float32(0))
         cut, full, floor = simd.splat(_ALPHA_MIN), simd.splat(_ALPHA_MAX), simd.splat(float32(-126))
-        for turn in range(lane, busiest.shape[0], lanes):
+        for turn in range(part, busiest.shape[0], PARTS):
             tile = busiest[turn]
             tile_y, tile_x = tile // columns, tile % columns
             start, end = starts[tile], ends[tile]
-            for k in range(end, starts[tile + 1]):
-                for j in range(9):
-                    slots[entries[k, 2], j] = float32(0)
+            if start == end:
+                continue
             for y in range(TILE):
                 o = (tile_y * TILE + y) * stride + tile_x * TILE
                 d_red, d_green = simd.load(d_pixels, o), simd.load(d_pixels, o + plane)
@@ -179,7 +180,7 @@ def blend_backward(
             for k in range(start, end):
                 if ((k - start) & 15) == 0 and k > start:
                     top, bottom = _unfinished_rows(block, top, bottom)
-                i, rows, slot = entries[k, 0], entries[k, 1], entries[k, 2]
+                i, rows = entries[k, 0], entries[k, 1]
                 dx = simd.iota(x0 - records[i, 0])
                 at_row = dx * dx * records[i, 2] + simd.splat(records[i, 5])
                 slope, curve = dx * records[i, 3], records[i, 4]
@@ -208,36 +209,27 @@ def blend_backward(
                     sum_red, sum_green = sum_red + weight * d_red, sum_green + weight * d_green
                     sum_blue = sum_blue + weight * d_blue
                 sum_ex = sum_e * dx
-                slots[slot, 0] = simd.reduce_sum(sum_e)
-                slots[slot, 1] = simd.reduce_sum(sum_ex)
-                slots[slot, 2] = simd.reduce_sum(sum_ey)
-                slots[slot, 3] = simd.reduce_sum(sum_ex * dx)
-                slots[slot, 4] = simd.reduce_sum(sum_ey * dx)
-                slots[slot, 5] = simd.reduce_sum(sum_eyy)
-                slots[slot, 6] = simd.reduce_sum(sum_red)
-                slots[slot, 7] = simd.reduce_sum(sum_green)
-                slots[slot, 8] = simd.reduce_sum(sum_blue)
+                shares = simd.reduce_sums(
+                    sum_e, sum_ex, sum_ey, sum_ex * dx, sum_ey * dx, sum_eyy,
+                    sum_red, sum_green, sum_blue,
+                )  # fmt: skip
+                simd.store(own, i * RECORD, simd.load(own, i * RECORD) + shares)
 
 
 @parallel
-def gather(
-    splats, slot_ranges, slots, conics, opacities, d_means2d, d_conics, d_opacities, d_colours
-):
-    """Sum every splat's slots into the gradients of what was projected.
-
-    The ``d_`` arrays must be zero where a splat is not among ``splats``.
-    """
-    for k in prange(splats.shape[0]):
-        i = splats[k]
+def gather(sums, conics, opacities, d_means2d, d_conics, d_opacities, d_colours):
+    """Turn every splat's sums over the parts into the gradients of what was projected."""
+    for i in prange(conics.shape[0]):
         e, ex, ey = float32(0), float32(0), float32(0)
         exx, exy, eyy = float32(0), float32(0), float32(0)
         red, green, blue = float32(0), float32(0), float32(0)
-        for s in range(slot_ranges[k, 0], slot_ranges[k, 1]):
-            e, ex, ey = e + slots[s, 0], ex + slots[s, 1], ey + slots[s, 2]
-            exx, exy, eyy = exx + slots[s, 3], exy + slots[s, 4], eyy + slots[s, 5]
-            red, green, blue = red + slots[s, 6], green + slots[s, 7], blue + slots[s, 8]
+        for part in range(PARTS):
+            own = sums[part, i]
+            e, ex, ey = e + own[0], ex + own[1], ey + own[2]
+            exx, exy, eyy = exx + own[3], exy + own[4], eyy + own[5]
+            red, green, blue = red + own[6], green + own[7], blue + own[8]
         a, b, c = conics[i, 0], conics[i, 1], conics[i, 2]
         d_means2d[i, 0], d_means2d[i, 1] = a * ex + b * ey, b * ex + c * ey
         d_conics[i, 0], d_conics[i, 1], d_conics[i, 2] = -_HALF * exx, -exy, -_HALF * eyy
-        d_opacities[i] = e / opacities[i]
+        d_opacities[i] = e / opacities[i] if opacities[i] > float32(0) else float32(0)
         d_colours[i, 0], d_colours[i, 1], d_colours[i, 2] = red, green, blue

@@ -230,6 +230,41 @@ def reduce_max(_typing: Any, x: Any) -> Any:
     return types.float32(vector), emit
 
 
+def _halved(builder: Any, x: Any, y: Any, group: int) -> Any:
+    """Add the halves of every ``group`` lanes of x and y; x's results come first, then y's."""
+    zero = _constant(0.0)
+    starts = range(0, LANES, group)
+    low = [start + i for start in starts for i in range(group // 2)]
+    low += [lane + LANES for lane in low]
+    high = [lane + group // 2 for lane in low]
+    x, y = zero if x is None else x, zero if y is None else y
+    parts = [builder.shuffle_vector(x, y, ir.Constant(_VECTOR_INT, m)) for m in (low, high)]
+    return builder.fadd(*parts, flags=_FAST)
+
+
+@intrinsic
+def reduce_sums(_typing: Any, *vectors: Any) -> Any:
+    """Return the vector whose lane j is the sum over lanes of argument j, 0 beyond the last.
+
+    A tree that halves groups of lanes of two vectors at a time needs 33 instructions for nine
+    vectors, where reducing them one by one takes 81.
+    """
+
+    def emit(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        values = list(builder.extract_value(args[0], i) for i in range(len(sig.args[0])))
+        values += [None] * (LANES - len(values))
+        group = LANES
+        while group > 1:
+            pairs = zip(values[::2], values[1::2], strict=True)
+            values = [
+                None if x is None and y is None else _halved(builder, x, y, group) for x, y in pairs
+            ]
+            group //= 2
+        return values[0]
+
+    return vector(types.StarArgTuple(vectors)), emit
+
+
 def make_product_tile(rows: int, columns: int) -> Any:
     """Make the inner loop of a matrix product, with ``rows`` x ``columns`` vectors in registers.
 

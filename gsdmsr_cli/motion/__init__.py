@@ -61,7 +61,5 @@ def start_motion(settings: Mapping[str, Any], facts: Facts, generator: torch.Gen
     """
     module = plugins.load(__name__, str(settings.get("name", "")))
     options = {key: value for key, value in settings.items() if key != "name"}
-    motion: Motion = module.start(
-        strict.build(module.Options, options, "motion"), facts, generator
-    )
+    motion: Motion = module.start(strict.build(module.Options, options, "motion"), facts, generator)
     return motion

@@ -155,18 +155,18 @@ class _Blend(Function):
         conics, opacities = ctx.saved_tensors
         bins, (rgb, transmittance) = ctx.bins, ctx.padded
         n = len(conics)
-        slots = np.empty((bins.slot_count, blending.SLOT), np.float32)
+        sums = np.empty((blending.PARTS, n, blending.RECORD), np.float32)
         blending.blend_backward(
-            ctx.records, bins.entries, bins.starts, bins.busiest, ctx.ends, threads(), ctx.columns,
+            ctx.records, bins.entries, bins.starts, bins.busiest, ctx.ends, ctx.columns,
             array(rgb), array(transmittance),
             array(padded(d_rgb, rgb.shape)),
             array(padded(None if d_alpha is None else d_alpha[..., None], (1, *rgb.shape[1:]))[0]),
-            slots,
+            sums,
         )  # fmt: skip
-        d_means2d, d_conics, d_colours = (torch.zeros(n, k) for k in (2, 3, 3))
-        d_opacities = torch.zeros(n)
+        d_means2d, d_conics, d_colours = (torch.empty(n, k) for k in (2, 3, 3))
+        d_opacities = torch.empty(n)
         blending.gather(
-            bins.splats, bins.slots, slots, array(conics), array(opacities),
+            sums, array(conics), array(opacities),
             array(d_means2d), array(d_conics), array(d_opacities), array(d_colours),
         )  # fmt: skip
         return None, None, d_means2d, d_conics, d_opacities, d_colours, None

@@ -174,7 +174,8 @@ def _ctrl_c() -> Iterator[threading.Event]:
         wanted.set()
         signal.signal(signal.SIGINT, earlier)
 
-    earlier = signal.signal(signal.SIGINT, want)
+    earlier = signal.getsignal(signal.SIGINT)
+    signal.signal(signal.SIGINT, want)
     try:
         yield wanted
     finally:

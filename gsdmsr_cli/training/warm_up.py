@@ -50,12 +50,10 @@ def warm_up(scene: Scene, preset: Preset, engine: Engine) -> float:
 
 def _short(preset: Preset) -> Preset:
     training = replace(preset.training, steps=STEPS, budget=None)
-    density = replace(
-        preset.density, every=5, start=0, until=1.0, gradient=1e-12, cap=4 * SPLATS
-    )
-    return replace(
-        preset, training=training, density=density, splats=replace(preset.splats, count=SPLATS)
-    )
+    growing = replace(preset.density, every=5, start=0, until=1.0, gradient=1e-12, cap=4 * SPLATS)
+    density = replace(growing, prune_scale=1e9, prune_opacity=0.0)
+    splats = replace(preset.splats, count=SPLATS)
+    return replace(preset, training=training, density=density, splats=splats)
 
 
 def _small(scene: Scene) -> Scene:

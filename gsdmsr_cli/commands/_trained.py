@@ -1,0 +1,72 @@
+"""What eval and render begin with: a run, its model and its data."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+
+from gsdmsr_cli import raster
+from gsdmsr_cli.errors import DataError
+from gsdmsr_cli.evaluation.protocol import Studio
+from gsdmsr_cli.formats import read_scene
+from gsdmsr_cli.pictures import Pictures
+from gsdmsr_cli.run import Checkpoint, Run, open_run
+from gsdmsr_cli.scene import Scene
+from gsdmsr_cli.training.trainer import BACKGROUNDS
+
+
+@dataclass(frozen=True, eq=False)
+class Trained:
+    """A run ready to be drawn.
+
+    Attributes:
+        run: the folder.
+        checkpoint: its last checkpoint.
+        scene: the data that it was trained on.
+        studio: its model and all that draws it.
+        device: where it is drawn, "cpu" or "cuda".
+    """
+
+    run: Run
+    checkpoint: Checkpoint
+    scene: Scene
+    studio: Studio
+    device: str
+
+
+def open_trained(
+    folder: Path, data: Path | None, background: str | None = None, downscale: int | None = None
+) -> Trained:
+    """Open a run with its data.
+
+    Args:
+        folder: the run folder.
+        data: where the data lies now, if not where it lay in training.
+        background: "white" or "black", if not the one of training.
+        downscale: divisor of the pictures' sides, if not the one of training.
+
+    Raises:
+        DataError: the run or its data cannot be used, or do not belong together.
+    """
+    run = open_run(folder)
+    model, checkpoint = run.load_model()
+    scene = _read_data(run, data)
+    options = run.preset.data
+    colour = BACKGROUNDS[background or options.background]
+    pictures = Pictures(colour, downscale or options.downscale, options.cache_mib << 20)
+    device = raster.pick_device("auto")
+    studio = Studio(model, raster.best_engine(device), pictures, torch.tensor(colour))
+    return Trained(run, checkpoint, scene, studio, device)
+
+
+def _read_data(run: Run, data: Path | None) -> Scene:
+    if data is None and not run.data.is_dir():
+        raise DataError(
+            f"{run.data}: the data that {run.root} was trained on is not there any more; "
+            "say with --data where it is"
+        )
+    scene = read_scene(data or run.data)
+    run.check_scene(scene)
+    return scene

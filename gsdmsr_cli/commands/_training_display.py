@@ -1,0 +1,65 @@
+"""Shows how a training stands: a live bar on a terminal, plain lines elsewhere; on stderr."""
+
+from __future__ import annotations
+
+from types import TracebackType
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskID, TextColumn
+
+from gsdmsr_cli.training.loop import Report
+
+LINE_EVERY = 0.05
+"""Progress between two plain lines."""
+
+
+class TrainingDisplay:
+    """A context that is shown every report."""
+
+    def __init__(self, console: Console | None = None) -> None:
+        self._console = console or Console(stderr=True)
+        self._live: Progress | None = None
+        self._task = TaskID(0)
+        self._next_line = 0.0
+        if self._console.is_terminal:
+            columns = TextColumn("training"), BarColumn(), TextColumn("{task.description}")
+            # few refreshes: the cores are training
+            self._live = Progress(*columns, console=self._console, refresh_per_second=2)
+            self._task = self._live.add_task("starting", total=1.0)
+
+    def __enter__(self) -> TrainingDisplay:
+        if self._live is not None:
+            self._live.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        where: TracebackType | None,
+    ) -> None:
+        if self._live is not None:
+            self._live.stop()
+
+    def show(self, report: Report) -> None:
+        """Show a report; without a terminal one in twenty or so."""
+        if self._live is not None:
+            self._live.update(self._task, completed=report.progress, description=describe(report))
+        elif report.progress >= min(self._next_line, 1.0):
+            self._next_line = report.progress + LINE_EVERY
+            self._console.print(describe(report), soft_wrap=True, highlight=False)
+
+
+def describe(report: Report) -> str:
+    """Return a report as one line."""
+    psnr = "none" if report.psnr is None else f"{report.psnr:.2f}"
+    return (
+        f"{report.progress:4.0%}  step {report.step}  {report.split} PSNR {psnr}  "
+        f"{report.splats} splats  {report.ms_per_step:.1f} ms/step  {_duration(report.remaining)} left"
+    )
+
+
+def _duration(seconds: float) -> str:
+    minutes, seconds = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02d}:{seconds:02d}" if hours else f"{minutes}:{seconds:02d}"

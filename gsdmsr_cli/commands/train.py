@@ -1,0 +1,172 @@
+"""gsdmsr train: reconstructs a moving scene from its pictures."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from rich.console import Console
+from rich.progress import Progress
+
+from gsdmsr_cli import machine, raster, strict
+from gsdmsr_cli.commands._training_display import TrainingDisplay
+from gsdmsr_cli.errors import UsageError
+from gsdmsr_cli.files import write_json
+from gsdmsr_cli.formats import read_scene
+from gsdmsr_cli.kernels.jit import set_threads
+from gsdmsr_cli.pictures import Pictures
+from gsdmsr_cli.preset import Preset, load_preset
+from gsdmsr_cli.run import SCHEMA, Run, continue_run, create_run, open_run, refuse_used
+from gsdmsr_cli.scene import Scene
+from gsdmsr_cli.training.loop import train
+from gsdmsr_cli.training.trainer import BACKGROUNDS, Trainer
+from gsdmsr_cli.training.warm_up import warm_up
+
+MAY_CHANGE = {
+    "training": ("budget", "steps", "threads", "checkpoint_minutes"),
+    "data": ("cache_mib",),
+}
+"""Options that a resumed training may have otherwise: its length, and what changes no result."""
+
+
+def run(
+    data: Path,
+    out: Path,
+    preset: str | None,
+    config: Path | None,
+    overrides: Sequence[str],
+    device: str,
+    resume: bool,
+    overwrite: bool,
+) -> None:
+    """Train the scene in ``data`` and write the run folder ``out``.
+
+    Raises:
+        UsageError: an option does not exist, or cannot be changed when resuming.
+        DataError: the data or the run folder cannot be used.
+        KeyboardInterrupt: Ctrl-C ended the training; ``out`` holds a checkpoint to go on from.
+    """
+    earlier = open_run(out) if resume else None
+    if earlier is None:
+        refuse_used(out, overwrite)
+        options = load_preset(preset, config, overrides)
+    else:
+        options = _resumed_options(earlier, preset, config, overrides)
+    where = raster.pick_device(device)
+    scene, load_s = _timed(lambda: read_scene(data))
+    if earlier is not None:
+        earlier.check_scene(scene)
+    trainer, timings = _prepare(scene, options, where)
+    timings["load_s"] += load_s
+    if earlier is None:
+        name = preset or (config.name if config else "default")
+        folder = create_run(out, name, options, trainer.facts, scene, overwrite)
+    else:
+        trainer.restore(earlier.load())
+        _require_rest(earlier, trainer)
+        folder = continue_run(earlier, options, scene)
+        folder.rewind_log(trainer.clock.step)
+    with TrainingDisplay() as display:
+        finished = train(trainer, folder, display.show)
+    _write_account(folder, trainer, where, timings)
+    _say_end(folder, trainer, data, finished)
+    if not finished:
+        raise KeyboardInterrupt
+
+
+def _prepare(scene: Scene, options: Preset, device: str) -> tuple[Trainer, dict[str, float]]:
+    """Return a training ready for its first step, and how long that took."""
+    torch.set_num_threads(set_threads(options.training.threads))
+    engine = raster.best_engine(device)
+    pictures = Pictures(
+        BACKGROUNDS[options.data.background], options.data.downscale, options.data.cache_mib << 20
+    )
+    trainer, start_s = _timed(lambda: Trainer(scene, options, engine, pictures))
+    _, load_s = _timed(lambda: _preload(pictures, scene))
+    compile_s = warm_up(scene, options, engine)
+    return trainer, {"load_s": load_s + start_s, "compile_s": compile_s}
+
+
+def _preload(pictures: Pictures, scene: Scene) -> None:
+    views = scene.split("train")
+    with Progress(console=Console(stderr=True), transient=True) as progress:
+        task = progress.add_task("reading pictures", total=len(views))
+        pictures.preload(views, lambda done, total: progress.update(task, completed=done))
+
+
+def _timed(work: Callable[[], Any]) -> tuple[Any, float]:
+    started = time.perf_counter()
+    result = work()
+    return result, time.perf_counter() - started
+
+
+def _resumed_options(
+    earlier: Run, preset: str | None, config: Path | None, overrides: Sequence[str]
+) -> Preset:
+    """Return the run's own options, with another length where the command line asks for one.
+
+    Raises:
+        UsageError: the command line asks for anything else.
+    """
+    stored = strict.dump(earlier.preset)
+    if preset is None and config is None:
+        own = [f"{topic}={json.dumps(value)}" for topic, value in stored.items()]
+        asked = load_preset(None, None, [*own, *overrides])
+    else:
+        asked = load_preset(preset, config, overrides)
+    for topic, value in strict.dump(asked).items():
+        for key in value.keys() | stored[topic].keys():
+            was, now = stored[topic].get(key), value.get(key)
+            if was != now and key not in MAY_CHANGE.get(topic, ()):
+                raise UsageError(
+                    f"{earlier.root}: was trained with {topic}.{key} = {json.dumps(was)}, not "
+                    f"{json.dumps(now)}; --resume may change only the length of a training"
+                )
+    return asked
+
+
+def _require_rest(earlier: Run, trainer: Trainer) -> None:
+    clock = trainer.clock
+    if clock.progress >= 1:
+        raise UsageError(
+            f"{earlier.root}: is complete at step {clock.step} after {clock.elapsed:.0f} s; "
+            "give it a longer --budget or more --steps"
+        )
+
+
+def _write_account(folder: Run, trainer: Trainer, device: str, timings: dict[str, float]) -> None:
+    """Write what the training took, the budget's share and what lies outside it."""
+    clock = trainer.clock
+    account = {
+        "schema": SCHEMA,
+        **{name: round(seconds, 3) for name, seconds in timings.items()},
+        "train_s": round(clock.elapsed, 3),
+        "steps": clock.step,
+        "progress": clock.progress,
+        "splats": len(trainer.model.splats),
+        "peak_rss_mib": machine.peak_rss_mib(),
+        "device": device,
+        "processor": machine.cpu_name(),
+        "threads": torch.get_num_threads(),
+        "versions": machine.versions(),
+    }
+    write_json(folder.training_path, account)
+
+
+def _say_end(folder: Run, trainer: Trainer, data: Path, finished: bool) -> None:
+    clock = trainer.clock
+    if finished:
+        text = (
+            f"trained {clock.step} steps in {clock.elapsed:.0f} s to "
+            f"{len(trainer.model.splats)} splats: {folder.root}"
+        )
+    else:
+        text = (
+            f"interrupted at step {clock.step}; continue with: "
+            f"gsdmsr train --data {data} --out {folder.root} --resume"
+        )
+    Console(stderr=True).print(text, soft_wrap=True, highlight=False, markup=False)

@@ -1,0 +1,71 @@
+"""How many pictures a second a model draws, with and without its motion."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from gsdmsr_cli.camera import Camera
+from gsdmsr_cli.model import Model
+from gsdmsr_cli.raster import Engine
+
+WARM_UP = 3
+"""Frames drawn before the clock starts."""
+
+SECONDS = 1.0
+"""Least time measured."""
+
+SHOTS = 16
+"""Most cameras that are drawn in turn; their moved splats are held in memory."""
+
+
+@dataclass(frozen=True)
+class Speed:
+    """Frames a second.
+
+    Attributes:
+        fps: moving the splats and drawing them.
+        fps_raster: drawing splats that have been moved before.
+        frames: number of frames timed for ``fps``.
+    """
+
+    fps: float
+    fps_raster: float
+    frames: int
+
+    def document(self) -> dict[str, Any]:
+        """Return the numbers for a report."""
+        return asdict(self) | {"warm_up_frames": WARM_UP}
+
+
+@torch.no_grad()
+def measure_speed(
+    model: Model, shots: Sequence[tuple[Camera, float]], engine: Engine, background: Tensor
+) -> Speed:
+    """Draw some of the (camera, time) in ``shots``, over again until a second has passed."""
+    chosen = shots[:: -(-len(shots) // SHOTS)]
+    cameras = [camera for camera, _ in chosen]
+
+    def move(i: int) -> object:
+        return engine.rasterize(model.at(chosen[i][1]), cameras[i], background)
+
+    fps, frames = _rate(move, len(chosen))
+    moved = [model.at(moment) for _, moment in chosen]
+    fps_raster, _ = _rate(lambda i: engine.rasterize(moved[i], cameras[i], background), len(chosen))
+    return Speed(fps, fps_raster, frames)
+
+
+def _rate(draw: Callable[[int], object], count: int) -> tuple[float, int]:
+    """Call ``draw`` with 0 to count - 1 in turn; return the calls a second and how many."""
+    for i in range(WARM_UP):
+        draw(i % count)
+    started, frames = time.perf_counter(), 0
+    while frames < count or time.perf_counter() - started < SECONDS:
+        draw(frames % count)
+        frames += 1
+    return frames / (time.perf_counter() - started), frames

@@ -1,0 +1,232 @@
+"""What every motion must keep to, over all files of the folder, and what is each one's own."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from kernel_checks import generator
+from motion_checks import FACTS, disturbed, splats_of, started
+from torch import Tensor
+
+from gsdmsr_cli import motion as motions
+from gsdmsr_cli import plugins
+from gsdmsr_cli.errors import UsageError
+from gsdmsr_cli.motion import Motion, start_motion
+from gsdmsr_cli.preset import OptimizerOptions
+from gsdmsr_cli.splats import Splats
+
+TIMES = (0.0, 0.3, 1.0)
+COUNT = 7
+
+every_motion = pytest.mark.parametrize("name", plugins.names(motions.__name__))
+every_grid = pytest.mark.parametrize("name", ["hexplane", "multiscale"])
+
+
+def assert_equal(found: Splats, expected: Splats, **tolerance: float) -> None:
+    for name, tensor in found.tensors().items():
+        truth = expected.tensors()[name]
+        if tolerance:
+            torch.testing.assert_close(tensor, truth, **tolerance, msg=name)
+        else:
+            assert torch.equal(tensor, truth), name
+
+
+def weighted_sum(splats: Splats) -> Tensor:
+    """Return a scalar that depends on every value of the splats, each with its own weight."""
+    rng, parts = generator(5), []
+    for tensor in splats.tensors().values():
+        parts.append((tensor * torch.randn(tensor.shape, generator=rng)).sum())
+    return torch.stack(parts).sum()
+
+
+def test_the_known_motions_are_found() -> None:
+    assert {"static", "hexplane", "multiscale"} <= set(plugins.names(motions.__name__))
+
+
+@every_motion
+def test_starts_as_the_identity(name: str) -> None:
+    splats = splats_of(COUNT)
+    for progress in (0.0, 1.0):
+        motion = started(name)
+        motion.advance(progress)
+        for time in TIMES:
+            assert_equal(motion.at(splats, time), splats)
+
+
+@every_motion
+def test_moves_once_it_has_learnt(name: str) -> None:
+    """So that the other tests compare something; only ``static`` has nothing to learn."""
+    splats = splats_of(COUNT)
+    motion = disturbed(started(name))
+    at_times = [motion.at(splats, time) for time in TIMES]
+    assert all(t.isfinite().all() for moved in at_times for t in moved.tensors().values())
+    assert (name == "static") == all(torch.equal(m.means, splats.means) for m in at_times)
+    assert (name == "static") == (not motion.tensors())
+
+
+@every_motion
+@given(rows=st.lists(st.integers(0, COUNT - 1), max_size=20), time=st.floats(0, 1, width=32))
+@settings(max_examples=15, deadline=None)
+def test_resize_then_move_is_move_then_resize(name: str, rows: list[int], time: float) -> None:
+    """Rows may repeat (clone, split), be absent (prune) or change places (reorder)."""
+    taken = torch.tensor(rows, dtype=torch.long)
+    splats, motion = splats_of(COUNT), disturbed(started(name))
+    expected = motion.at(splats, time).take(taken)
+    motion.take(taken)
+    assert_equal(motion.at(splats.take(taken), time), expected, atol=1e-6, rtol=1e-6)
+
+
+@every_motion
+def test_gradients_reach_everything_that_is_trained(name: str) -> None:
+    splats = splats_of(50).map(torch.nn.Parameter)
+    motion = disturbed(started(name))
+    tensors = motion.tensors()
+    loss = torch.stack([weighted_sum(motion.at(splats, time)) for time in TIMES]).sum()
+    loss.backward()
+    for what, tensor in {**splats.tensors(), **{n: tensors[n] for n in motion.groups()}}.items():
+        assert tensor.requires_grad, what
+        assert tensor.grad is not None and tensor.grad.isfinite().all(), what
+        assert tensor.grad.any(), what
+
+
+@every_motion
+def test_groups_name_trained_tensors_and_learning_rates(name: str) -> None:
+    motion = started(name)
+    rates = {field.name for field in fields(OptimizerOptions)}
+    assert motion.groups().keys() <= motion.tensors().keys()
+    assert set(motion.groups().values()) <= rates
+
+
+@every_motion
+def test_penalty_is_a_finite_scalar_that_can_be_learnt_from(name: str) -> None:
+    motion = disturbed(started(name))
+    motion.at(splats_of(COUNT), 0.4)
+    penalty = motion.penalty()
+    if penalty is None:
+        return
+    assert penalty.shape == () and penalty.isfinite() and penalty > 0
+    penalty.backward()
+    assert any(t.grad is not None and t.grad.any() for t in motion.tensors().values())
+
+
+@every_motion
+def test_tensors_keep_their_names_and_order(name: str) -> None:
+    motion = started(name)
+    before = list(motion.tensors())
+    assert list(disturbed(started(name)).tensors()) == before
+    motion.at(splats_of(COUNT), 0.5)
+    motion.take(torch.tensor([0, 2]))
+    assert list(motion.tensors()) == before
+
+
+@every_motion
+def test_an_unknown_option_is_refused_with_the_nearest(name: str) -> None:
+    with pytest.raises(UsageError, match="no_such_option"):
+        started(name, no_such_option=3)
+
+
+def test_a_misspelt_option_or_name_is_answered_with_the_nearest() -> None:
+    with pytest.raises(UsageError, match=r"chanels.*did you mean 'channels'"):
+        started("hexplane", chanels=16)
+    with pytest.raises(UsageError, match=r"unknown motion 'hexplan'; did you mean 'hexplane'\?"):
+        started("hexplan")
+    with pytest.raises(UsageError, match="unknown motion ''"):
+        start_motion({}, FACTS, generator())
+
+
+@every_grid
+def test_times_outside_are_those_at_the_ends(name: str) -> None:
+    splats, motion = splats_of(COUNT), disturbed(started(name))
+    assert_equal(motion.at(splats, 1.6), motion.at(splats, 1.0))
+    assert_equal(motion.at(splats, -0.5), motion.at(splats, 0.0))
+
+
+@every_grid
+@pytest.mark.parametrize("time", [0.0, 1.0])
+def test_time_is_mapped_over_the_whole_grid(name: str, time: float) -> None:
+    """At either end of time only that end of the temporal planes is read."""
+    motion = disturbed(started(name))
+    weighted_sum(motion.at(splats_of(COUNT), time)).backward()
+    planes = {n: t.grad for n, t in motion.tensors().items() if n.endswith(".time")}
+    assert planes
+    end = -1 if time else 0
+    for what, gradient in planes.items():
+        assert gradient is not None, what
+        read = gradient.abs().sum(dim=(0, 1, 3, 4)) > 0
+        assert read[end] and int(read.sum()) == 1, what
+
+
+@every_grid
+def test_detach_keeps_the_field_out_of_the_positions_gradient(name: str) -> None:
+    splats = splats_of(COUNT).map(torch.nn.Parameter)
+    motion = disturbed(started(name, detach=True))
+    motion.at(splats, 0.3).means.sum().backward()
+    assert torch.equal(splats.means.grad, torch.ones_like(splats.means))
+
+
+def gradients_before_and_after(motion: Motion, progress: tuple[float, float]) -> list[set[str]]:
+    """Return the names of the tensors that get a gradient at each progress."""
+    reached = []
+    for now in progress:
+        motion.advance(now)
+        loss = weighted_sum(motion.at(splats_of(COUNT), 0.3))
+        penalty = motion.penalty()
+        assert penalty is not None
+        (loss + penalty).backward()
+        tensors = motion.tensors()
+        reached.append({name for name, tensor in tensors.items() if tensor.grad is not None})
+        for tensor in tensors.values():
+            tensor.grad = None
+    return reached
+
+
+def test_multiscale_freezes_the_fine_field_before_coarse_until() -> None:
+    motion = disturbed(started("multiscale", coarse_until=0.25))
+    coarse, both = gradients_before_and_after(motion, (0.2, 0.25))
+    assert coarse and all(name.startswith("coarse") for name in coarse)
+    assert both == set(motion.tensors())
+
+
+def test_multiscale_moves_positions_only_while_coarse() -> None:
+    splats, motion = splats_of(COUNT), disturbed(started("multiscale", coarse_until=0.25))
+    motion.advance(0.1)
+    coarse = motion.at(splats, 0.3)
+    assert not torch.equal(coarse.means, splats.means)
+    for name in ("quats", "log_scales", "logit_opacities", "sh"):
+        assert torch.equal(coarse.tensors()[name], splats.tensors()[name]), name
+    motion.advance(0.3)
+    fine = motion.at(splats, 0.3)
+    for name in ("means", "quats", "log_scales"):
+        assert not torch.equal(fine.tensors()[name], coarse.tensors()[name]), name
+
+
+def test_multiscale_regularises_the_coarse_offset() -> None:
+    """L_reg is the mean squared offset in units of the bound."""
+    splats = splats_of(COUNT)
+    weights = {"space_smoothness": 0.0, "time_smoothness": 0.0, "time_stillness": 0.0}
+    motion = disturbed(started("multiscale", offset_weight=2.0, coarse_until=1.0, **weights))
+    motion.advance(0.0)
+    offset = motion.at(splats, 0.6).means - splats.means
+    penalty = motion.penalty()
+    assert penalty is not None
+    expected = 2.0 * (offset / FACTS.bound).square().sum(dim=1).mean()
+    torch.testing.assert_close(penalty, expected, rtol=1e-4, atol=1e-9)
+
+
+def test_multiscale_without_the_pyramid_gives_the_decoder_fewer_inputs() -> None:
+    inputs = [
+        started("multiscale", pyramid=pyramid).tensors()["decoder.0.weight"].shape[0]
+        for pyramid in (True, False)
+    ]
+    assert inputs[0] - inputs[1] == 16
+
+
+@pytest.mark.parametrize(("frames", "nodes"), [(2, 8), (100, 25), (150, 38)])
+def test_the_time_grid_follows_from_the_frames(frames: int, nodes: int) -> None:
+    facts = motions.Facts(bound=1.0, frames=frames)
+    motion = start_motion({"name": "hexplane"}, facts, generator())
+    assert motion.tensors()["grid.0.time"].shape[2] == nodes

@@ -1,0 +1,174 @@
+"""Adam: against torch's own in float64, and what multipliers and resizes must leave alone."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from kernel_checks import assert_same_on_threads, generator
+from torch import Tensor
+
+from gsdmsr_cli.training.optimizer import BETA1, BETA2, EPS, Adam, adam_step, adam_step_twin
+
+SHAPES = [(1,), (16,), (7, 3), (33, 4, 3), (5, 4), (100,)]
+STEPS = 6
+
+Move = Callable[..., None]
+
+
+def gradients_of(shape: tuple[int, ...], seed: int = 0) -> list[Tensor]:
+    """Return a gradient per step, over several orders of magnitude."""
+    rng = generator(seed)
+    size = torch.randn(shape, generator=rng).exp()
+    return [torch.randn(shape, generator=rng) * size for _ in range(STEPS)]
+
+
+def moved(
+    move: Move,
+    start: Tensor,
+    gradients: list[Tensor],
+    multipliers: Tensor | None = None,
+    rate: float = 0.01,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return values and both moments after one step per gradient."""
+    values = start.clone()
+    first, second = torch.zeros_like(values), torch.zeros_like(values)
+    for step, gradient in enumerate(gradients, start=1):
+        move(values, gradient.to(values.dtype), first, second, step, rate, multipliers)
+    return values, first, second
+
+
+def by_torch(start: Tensor, gradients: list[Tensor], rates: list[float]) -> Tensor:
+    values = start.double().requires_grad_()
+    optimizer = torch.optim.Adam([values], betas=(BETA1, BETA2), eps=EPS)
+    for gradient, rate in zip(gradients, rates, strict=True):
+        optimizer.param_groups[0]["lr"] = rate
+        values.grad = gradient.double()
+        optimizer.step()
+    return values.detach()
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("ones", [False, True])
+@pytest.mark.parametrize("shape", SHAPES, ids=str)
+def test_steps_are_those_of_torch(shape: tuple[int, ...], ones: bool, dtype: torch.dtype) -> None:
+    """float32 goes to the kernels, float64 to the twin; the rate changes from step to step."""
+    start, gradients = torch.randn(shape, generator=generator(1)), gradients_of(shape)
+    rates = [0.01 * 0.8**step for step in range(STEPS)]
+    tensor, optimizer = start.to(dtype, copy=True).requires_grad_(), Adam()
+    for gradient, rate in zip(gradients, rates, strict=True):
+        tensor.grad = gradient.to(dtype)
+        optimizer.step({"x": tensor}, {"x": rate}, torch.ones(shape[0]) if ones else None)
+        assert tensor.grad is None
+    assert optimizer.steps == {"x": STEPS}
+    expected = by_torch(start, gradients, rates)
+    # 1 - beta2 in float32 is off by a relative 1.3e-5
+    atol, rtol = (1e-6, 5e-5) if dtype == torch.float32 else (1e-12, 1e-12)
+    travelled = tensor.detach().double() - start
+    torch.testing.assert_close(travelled, expected - start, atol=atol, rtol=rtol)
+
+
+@pytest.mark.parametrize("move", [adam_step, adam_step_twin])
+def test_the_multiplier_scales_the_step_of_its_row(move: Move) -> None:
+    start, gradients = torch.zeros(5, 3), gradients_of((5, 3))[:1]
+    factors = torch.tensor([1.0, 0.5, 2.0, 0.0, -1.0])
+    plain, first, second = moved(move, start, gradients, torch.ones(5))
+    scaled, first_scaled, second_scaled = moved(move, start, gradients, factors)
+    torch.testing.assert_close(scaled, plain * factors[:, None], atol=1e-9, rtol=1e-6)
+    active = factors != 0
+    assert torch.equal(first_scaled[active], first[active])
+    assert torch.equal(second_scaled[active], second[active])
+
+
+@pytest.mark.parametrize("move", [adam_step, adam_step_twin])
+@pytest.mark.parametrize("shape", [(6,), (6, 4, 3)], ids=str)
+def test_a_row_with_multiplier_0_keeps_every_bit(move: Move, shape: tuple[int, ...]) -> None:
+    """Even if its gradient is not a number."""
+    rng = generator(2)
+    values, first, second = (torch.rand(shape, generator=rng) for _ in range(3))
+    before = [t.clone() for t in (values, first, second)]
+    gradient = torch.randn(shape, generator=rng)
+    factors = torch.tensor([1.0, 0.0, 0.5, 0.0, 1.0, 0.0])
+    gradient[1], gradient[3] = float("nan"), float("inf")
+    move(values, gradient, first, second, 3, 0.01, factors)
+    skipped = factors == 0
+    for now, old in zip((values, first, second), before, strict=True):
+        assert torch.equal(now[skipped], old[skipped])
+        assert (now[~skipped] != old[~skipped]).all()
+
+
+@pytest.mark.parametrize("move", [adam_step, adam_step_twin])
+@given(exponent=st.integers(-6, 6))
+@settings(max_examples=13, deadline=None)
+def test_the_size_of_gradients_does_not_matter(move: Move, exponent: int) -> None:
+    start, gradients = torch.zeros(9, 3), gradients_of((9, 3))
+    scaled = [gradient * 2.0**exponent for gradient in gradients]
+    plain = moved(move, start, gradients)[0]
+    torch.testing.assert_close(moved(move, start, scaled)[0], plain, atol=1e-9, rtol=1e-5)
+
+
+def test_the_first_step_has_the_length_of_the_rate() -> None:
+    start, gradient = torch.zeros(20), gradients_of((20,))[0]
+    values = moved(adam_step, start, [gradient], rate=0.03)[0]
+    torch.testing.assert_close(values, -0.03 * gradient.sign(), rtol=1e-5, atol=0)
+
+
+@pytest.mark.parametrize("rows", [None, torch.full((40,), 0.5)], ids=["flat", "rows"])
+def test_kernels_keep_pace_with_the_twin(rows: Tensor | None) -> None:
+    start, gradients = torch.randn(40, 3, generator=generator(3)), gradients_of((40, 3))
+    ours = moved(adam_step, start, gradients, rows)
+    exact = moved(adam_step_twin, start.double(), gradients, rows)
+    for found, truth in zip(ours, exact, strict=True):
+        torch.testing.assert_close(found.double(), truth, atol=1e-6, rtol=5e-5)
+
+
+def test_tensors_without_a_gradient_stay() -> None:
+    still, moving = torch.ones(4, requires_grad=True), torch.ones(4, requires_grad=True)
+    moving.grad = torch.ones(4)
+    optimizer = Adam()
+    optimizer.step({"still": still, "moving": moving}, {"still": 1.0, "moving": 0.1})
+    assert torch.equal(still, torch.ones(4))
+    assert (moving < 1).all()
+    assert optimizer.steps == {"moving": 1}
+
+
+def trained_adam() -> Adam:
+    tensors = {name: torch.zeros(4, 3, requires_grad=True) for name in ("splats", "field")}
+    optimizer = Adam()
+    for tensor in tensors.values():
+        tensor.grad = gradients_of((4, 3))[0]
+    optimizer.step(tensors, dict.fromkeys(tensors, 0.1))
+    return optimizer
+
+
+def test_take_follows_the_parents_and_fresh_rows_have_no_moments() -> None:
+    optimizer, before = trained_adam(), trained_adam()
+    rows, fresh = torch.tensor([2, 0, 2, 3, 3]), torch.tensor([False, False, True, True, False])
+    optimizer.take(["splats", "never trained"], rows, fresh)
+    for now, old in ((optimizer.first, before.first), (optimizer.second, before.second)):
+        assert torch.equal(now["splats"][~fresh], old["splats"][rows[~fresh]])
+        assert not now["splats"][fresh].any()
+        assert torch.equal(now["field"], old["field"])
+        assert now.keys() == {"splats", "field"}
+    assert optimizer.steps == before.steps
+
+
+def test_forget_clears_one_tensor() -> None:
+    optimizer, before = trained_adam(), trained_adam()
+    optimizer.forget("splats", second=False)
+    assert not optimizer.first["splats"].any()
+    assert torch.equal(optimizer.second["splats"], before.second["splats"])
+    optimizer.forget("splats")
+    optimizer.forget("never trained")
+    assert not optimizer.second["splats"].any()
+    assert torch.equal(optimizer.first["field"], before.first["field"])
+
+
+@pytest.mark.parametrize("rows", [False, True])
+def test_results_do_not_depend_on_the_number_of_threads(rows: bool) -> None:
+    start, gradients = torch.randn(333, 3, generator=generator(4)), gradients_of((333, 3))
+    factors = torch.linspace(0, 1, 333) if rows else None
+    assert_same_on_threads(lambda: moved(adam_step, start, gradients, factors))
