@@ -12,7 +12,6 @@ earlier one. The folder can be moved; nothing in it is pickled.
 from __future__ import annotations
 
 import json
-import os
 import shutil
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
@@ -144,7 +143,7 @@ class Run:
         beside = self.checkpoint_path.with_suffix(".part")
         try:
             save_file(tensors, beside, metadata={"gsdmsr": json.dumps(state)})
-            os.replace(beside, self.checkpoint_path)
+            beside.replace(self.checkpoint_path)
         except (OSError, SafetensorError) as error:
             beside.unlink(missing_ok=True)
             raise DataError(f"{self.checkpoint_path}: cannot be written: {error}") from error

@@ -53,9 +53,10 @@ class TrainingDisplay:
 def describe(report: Report) -> str:
     """Return a report as one line."""
     psnr = "none" if report.psnr is None else f"{report.psnr:.2f}"
+    left = _duration(report.remaining)
     return (
         f"{report.progress:4.0%}  step {report.step}  {report.split} PSNR {psnr}  "
-        f"{report.splats} splats  {report.ms_per_step:.1f} ms/step  {_duration(report.remaining)} left"
+        f"{report.splats} splats  {report.ms_per_step:.1f} ms/step  {left} left"
     )
 
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 
 from rich.console import Console
-from rich.progress import Progress
 
 from gsdmsr_cli.commands import eval as evaluate
 from gsdmsr_cli.commands import render, train
+from gsdmsr_cli.commands._progress import progress_bar
 from gsdmsr_cli.errors import UsageError
 from gsdmsr_cli.synthetic import write_scene
 
@@ -28,7 +28,7 @@ def run(out: Path) -> None:
     console = Console()
     _claim(out)
     scene, run_folder = out / "scene", out / "run"
-    _write_scene(scene, console)
+    _write_scene(scene)
     overrides = [f"training.budget={BUDGET}"]
     train.run(scene, run_folder, "dnerf", None, overrides, "auto", False, run_folder.exists())
     evaluate.run(run_folder, "test", None, None, None, False, [])
@@ -46,13 +46,9 @@ def _claim(out: Path) -> None:
     (out / MARKER).touch()
 
 
-def _write_scene(folder: Path, console: Console) -> None:
-    with Progress(console=console, transient=True) as progress:
-        task = progress.add_task("drawing the scene", total=None)
-        write_scene(
-            folder,
-            progress=lambda done, total: progress.update(task, completed=done, total=total),
-        )
+def _write_scene(folder: Path) -> None:
+    with progress_bar("drawing the scene") as tell:
+        write_scene(folder, progress=tell)
 
 
 def _where_to_look(scene: Path, run_folder: Path) -> str:

@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import Any
 
 from rich.console import Console
-from rich.progress import Progress
 from rich.table import Table
 
 from gsdmsr_cli import machine
+from gsdmsr_cli.commands._progress import progress_bar
 from gsdmsr_cli.commands._trained import Trained, open_trained
 from gsdmsr_cli.errors import ThresholdError, UsageError, nearest
 from gsdmsr_cli.evaluation import protocol
@@ -73,14 +73,10 @@ def _measure(
     resolution = camera.width, camera.height
     nets = protocol.load_nets(resolution, folder=lpips_weights)
     seen = _evenly(trained.scene.split("train"), TRAIN_VIEWS)
-    with Progress(console=Console(stderr=True), transient=True) as progress:
-        task = progress.add_task("comparing pictures", total=len(views) + len(seen))
-
-        def tell() -> None:
-            progress.advance(task)
-
-        frames = protocol.score_views(studio, views, nets, tell)
-        train = protocol.score_views(studio, seen, {}, tell)
+    total = len(views) + len(seen)
+    with progress_bar("comparing pictures") as tell:
+        frames = protocol.score_views(studio, views, nets, lambda done: tell(done, total))
+        train = protocol.score_views(studio, seen, {}, lambda done: tell(len(views) + done, total))
     shots = [(studio.pictures.camera(view), view.time) for view in views]
     speed = measure_speed(studio.model, shots, studio.engine, studio.background)
     aggregate = protocol.average([scores for _, scores in frames])
@@ -126,11 +122,12 @@ def _evenly(views: Sequence[View], count: int) -> list[View]:
 
 
 def _training(trained: Trained) -> dict[str, Any]:
-    """Return how the training went; an interrupted one has said nothing but its checkpoint."""
+    """Return how the training went; one that was killed has left nothing but a checkpoint."""
     path, checkpoint = trained.run.training_path, trained.checkpoint
     said = read_json(path) if path.is_file() else {}
     splats = len(trained.studio.model.splats)
-    return said | {"steps": checkpoint.step, "train_s": checkpoint.elapsed, "splats": splats}
+    known = {"steps": checkpoint.step, "train_s": checkpoint.elapsed, "splats": splats}
+    return known | (said if said.get("steps") == checkpoint.step else {})
 
 
 def _threshold(text: str) -> tuple[str, float]:

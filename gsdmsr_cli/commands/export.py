@@ -7,9 +7,9 @@ from typing import cast
 
 import torch
 from rich.console import Console
-from rich.progress import Progress
 
 from gsdmsr_cli import exports, plugins
+from gsdmsr_cli.commands._progress import progress_bar
 from gsdmsr_cli.errors import UsageError
 from gsdmsr_cli.exports import Exporter, ExportOptions
 from gsdmsr_cli.run import open_run
@@ -26,13 +26,12 @@ def run(run_folder: Path, format_: str, time: float | None, frames: int | None, 
         raise UsageError("--time and --frames are both given; drop one")
     exporter = cast(Exporter, plugins.load(exports.__name__, format_.replace("-", "_")))
     model, _ = open_run(run_folder).load_model()
-    with Progress(console=Console(stderr=True), transient=True) as progress, torch.no_grad():
-        task = progress.add_task("writing splats", total=None)
+    with progress_bar("writing splats") as tell, torch.no_grad():
         options = ExportOptions(
             time=time or 0.0,
             frames=frames or 0,
             times=() if time is None else (time,),
-            progress=lambda done, total: progress.update(task, completed=done, total=total),
+            progress=tell,
         )
         written = exporter.export(model, out, options)
     count, splats = len(written), len(model.splats)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,9 +11,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from rich.console import Console
-from rich.progress import Progress
 
 from gsdmsr_cli.camera import Camera
+from gsdmsr_cli.commands._progress import Tell, progress_bar
 from gsdmsr_cli.commands._trained import Trained, open_trained
 from gsdmsr_cli.errors import DataError, UsageError
 from gsdmsr_cli.evaluation.metrics import quantize
@@ -72,12 +72,10 @@ def run(
     target = out or run_folder / "render"
     for film in films:
         _make_room(target / film.name, len(film.shots), ours=out is None)
-    with Progress(console=Console(stderr=True), transient=True) as progress:
-        for film in films:
-            task = progress.add_task(f"drawing {film.name}", total=len(film.shots))
-            pictures = _draw(trained, film, target / film.name, lambda t=task: progress.advance(t))
-            write_webm(target / f"{film.name}.webm", pictures, film.fps)
     for film in films:
+        with progress_bar(f"drawing {film.name}") as tell:
+            pictures = _draw(trained, film, target / film.name, tell)
+            write_webm(target / f"{film.name}.webm", pictures, film.fps)
         text = f"wrote {target / film.name}.webm and {len(film.shots)} pictures beside it"
         Console().print(text, soft_wrap=True, highlight=False)
 
@@ -92,7 +90,8 @@ def _orbit(trained: Trained, count: int) -> Film:
     # formats place what is to be reconstructed round the world's origin, see Scene.bound
     cameras = [trained.studio.pictures.camera(view) for view in trained.scene.split("train")]
     moments = [i / max(count - 1, 1) for i in range(count)]
-    return Film("orbit", list(zip(orbit(cameras, np.zeros(3), count), moments)), ORBIT_FPS)
+    around = orbit(cameras, np.zeros(3), count)
+    return Film("orbit", list(zip(around, moments, strict=True)), ORBIT_FPS)
 
 
 def _make_room(folder: Path, count: int, ours: bool) -> None:
@@ -118,14 +117,12 @@ def _make_room(folder: Path, count: int, ours: bool) -> None:
 
 
 @torch.no_grad()
-def _draw(
-    trained: Trained, film: Film, folder: Path, tell: Callable[[], object]
-) -> Iterator[NDArray[np.uint8]]:
+def _draw(trained: Trained, film: Film, folder: Path, tell: Tell) -> Iterator[NDArray[np.uint8]]:
     """Draw, write and yield every frame."""
     studio = trained.studio
     for index, (camera, moment) in enumerate(film.shots):
         frame = draw(studio.model, camera, moment, studio.engine, studio.background)
         pixels = (quantize(frame.rgb) * 255).round().to(torch.uint8).numpy(force=True)
         write_png(folder / f"{index:04d}.png", pixels)
-        tell()
+        tell(index + 1, len(film.shots))
         yield pixels

@@ -10,9 +10,9 @@ from typing import Any
 
 import torch
 from rich.console import Console
-from rich.progress import Progress
 
 from gsdmsr_cli import machine, raster, strict
+from gsdmsr_cli.commands._progress import progress_bar
 from gsdmsr_cli.commands._training_display import TrainingDisplay
 from gsdmsr_cli.errors import UsageError
 from gsdmsr_cli.files import write_json
@@ -92,10 +92,8 @@ def _prepare(scene: Scene, options: Preset, device: str) -> tuple[Trainer, dict[
 
 
 def _preload(pictures: Pictures, scene: Scene) -> None:
-    views = scene.split("train")
-    with Progress(console=Console(stderr=True), transient=True) as progress:
-        task = progress.add_task("reading pictures", total=len(views))
-        pictures.preload(views, lambda done, total: progress.update(task, completed=done))
+    with progress_bar("reading pictures") as tell:
+        pictures.preload(scene.split("train"), tell)
 
 
 def _timed(work: Callable[[], Any]) -> tuple[Any, float]:

@@ -85,17 +85,17 @@ def score_views(
     studio: Studio,
     views: Iterable[View],
     nets: Mapping[str, Lpips | Missing],
-    tell: Callable[[], None],
+    tell: Callable[[int], None],
 ) -> list[tuple[View, Scores]]:
-    """Return the scores of every view; ``tell`` is called after each.
+    """Return the scores of every view; ``tell`` is called with how many are done.
 
     Raises:
         DataError: a picture cannot be read.
     """
     scored = []
-    for view in views:
+    for done, view in enumerate(views, start=1):
         scored.append((view, score(studio.draw(view), studio.true(view), nets)))
-        tell()
+        tell(done)
     return scored
 
 
@@ -137,11 +137,11 @@ def _explained(value: float | None, net: Lpips | Missing) -> dict[str, Any]:
     if isinstance(net, Missing):
         return {"value": None, "reason": net.reason, "searched": list(net.searched)}
     reason = None if value is not None else "not a number in at least one frame"
-    return {"value": value, "reason": reason}
+    return {"value": value, "reason": reason, "searched": []}
 
 
 def storage(tensors: Mapping[str, Tensor]) -> dict[str, int]:
-    """Return the bytes of a checkpoint's tensors: the splats, the motion, and what training adds."""
+    """Return the bytes of a checkpoint's tensors: splats, motion, and what training adds."""
     sizes = {"splats_bytes": 0, "motion_bytes": 0, "training_state_bytes": 0}
     for name, tensor in tensors.items():
         splats, moved = name.startswith(STORED_AS), name.startswith(MOVED_BY)

@@ -8,21 +8,31 @@ import torch
 from torch import Tensor
 
 from gsdmsr_cli.geometry import SH_C0
+from gsdmsr_cli.pictures import Pictures
 from gsdmsr_cli.preset import SplatOptions
 from gsdmsr_cli.scene import Scene
 from gsdmsr_cli.splats import Splats
+from gsdmsr_cli.training.silhouettes import sample_points
 
 NEIGHBOURS = 3
 
 
-def initial_splats(scene: Scene, options: SplatOptions, generator: torch.Generator) -> Splats:
+def initial_splats(
+    scene: Scene,
+    options: SplatOptions,
+    pictures: Pictures,
+    background: Tensor,
+    generator: torch.Generator,
+) -> Splats:
     """Return isotropic splats as large as the distance to their neighbours (3DGS, section 5.1).
 
-    Without points of its own the scene's box is filled at random with nearly grey splats, as all
-    methods do on D-NeRF.
+    They sit at the scene's own points, else at random in its box: evenly and nearly grey as all
+    methods do on D-NeRF, or where silhouettes overlap (see ``silhouettes``).
     """
     if len(scene.points):
         means, colours = torch.from_numpy(scene.points), torch.from_numpy(scene.colours)
+    elif options.start == "silhouettes":
+        means, colours = sample_points(scene, pictures, background, options.count, generator)
     else:
         means = (2 * torch.rand(options.count, 3, generator=generator) - 1) * scene.bound
         colours = 0.5 + SH_C0 * torch.rand(options.count, 3, generator=generator) / 255
@@ -32,9 +42,9 @@ def initial_splats(scene: Scene, options: SplatOptions, generator: torch.Generat
     quats = torch.zeros(n, 4)
     quats[:, 0] = 1
     return Splats(
-        means=means.float(),
+        means=means,
         quats=quats,
-        log_scales=_spacing(means.float(), scene.bound).log()[:, None].repeat(1, 3),
+        log_scales=_spacing(means, scene.bound).log()[:, None].repeat(1, 3),
         logit_opacities=torch.full((n,), math.log(options.opacity / (1 - options.opacity))),
         sh=sh,
     )

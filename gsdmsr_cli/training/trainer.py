@@ -61,13 +61,13 @@ class Trainer:
         self.radius = scene.radius
         self.generator = torch.Generator().manual_seed(preset.training.seed)
         self.facts = facts_of(scene)
+        self.background = torch.tensor(BACKGROUNDS[preset.data.background])
         self.model = Model(
-            initial_splats(scene, preset.splats, self.generator),
+            initial_splats(scene, preset.splats, pictures, self.background, self.generator),
             start_motion(preset.motion, self.facts, self.generator),
         )
         self.optimizer = Adam()
         self.statistics = DensityStatistics(len(self.model.splats))
-        self.background = torch.tensor(BACKGROUNDS[preset.data.background])
         self.clock = new_clock(preset.training)
         self._queue: list[int] = []
         self._resets = 0

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 from dataclasses import fields
+from functools import cache
 
 import pytest
 import torch
@@ -33,6 +35,12 @@ def assert_equal(found: Splats, expected: Splats, **tolerance: float) -> None:
             torch.testing.assert_close(tensor, truth, **tolerance, msg=name)
         else:
             assert torch.equal(tensor, truth), name
+
+
+@cache
+def learnt(name: str) -> Motion:
+    """Return a motion that moves; to be copied by whoever resizes it."""
+    return disturbed(started(name))
 
 
 def weighted_sum(splats: Splats) -> Tensor:
@@ -74,7 +82,7 @@ def test_moves_once_it_has_learnt(name: str) -> None:
 def test_resize_then_move_is_move_then_resize(name: str, rows: list[int], time: float) -> None:
     """Rows may repeat (clone, split), be absent (prune) or change places (reorder)."""
     taken = torch.tensor(rows, dtype=torch.long)
-    splats, motion = splats_of(COUNT), disturbed(started(name))
+    splats, motion = splats_of(COUNT), copy.deepcopy(learnt(name))
     expected = motion.at(splats, time).take(taken)
     motion.take(taken)
     assert_equal(motion.at(splats.take(taken), time), expected, atol=1e-6, rtol=1e-6)

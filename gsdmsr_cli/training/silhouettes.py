@@ -1,0 +1,84 @@
+"""Where a scene can be, from its train pictures alone: points that fall on what is drawn."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from gsdmsr_cli.camera import Camera
+from gsdmsr_cli.pictures import Pictures
+from gsdmsr_cli.scene import Scene
+
+CANDIDATES = 20
+"""Random points per point wanted."""
+
+SHARPNESS = 4.0
+"""Points are drawn with the probability of their share of silhouettes to this power."""
+
+DIFFERENCE = 8
+"""A pixel belongs to the silhouette if a channel differs this much from the background [1/255]."""
+
+GRID = 100
+"""Pictures are sampled at about so many pixels along a side, enough for a first guess."""
+
+
+class Points(NamedTuple):
+    """Random points with a colour.
+
+    Attributes:
+        means: (P, 3) [world units].
+        colours: (P, 3) in [0, 1].
+    """
+
+    means: Tensor
+    colours: Tensor
+
+
+def sample_points(
+    scene: Scene, pictures: Pictures, background: Tensor, count: int, generator: torch.Generator
+) -> Points:
+    """Return random points in the scene's box, where the train views' silhouettes overlap.
+
+    A point inside a still solid lies in every silhouette, one on a limb that moves in some, one in
+    empty space in few. The colour is the mean of the pixels that it falls on inside silhouettes.
+    Pictures without a plain background are silhouette all over: then points fill the box evenly.
+
+    Args:
+        scene: gives views and box.
+        pictures: the train pictures, composited on ``background`` (3,).
+        count: number of points.
+        generator: source of the random points.
+    """
+    candidates = (2 * torch.rand(CANDIDATES * count, 3, generator=generator) - 1) * scene.bound
+    inside, seen = torch.zeros(len(candidates)), torch.zeros(len(candidates))
+    colours = torch.zeros(len(candidates), 3)
+    plain = (background * 255).round()
+    for view in scene.split("train"):
+        picture, camera = pictures.load(view), pictures.camera(view)
+        stride = max(1, min(picture.shape[1:]) // GRID)
+        pixels = picture[:, ::stride, ::stride].permute(1, 2, 0).float()
+        drawn = (pixels - plain).abs().amax(dim=2) > DIFFERENCE
+        visible, row, column = _pixels_of(candidates, camera, stride, drawn.shape)
+        hit = visible & drawn[row, column]
+        seen += visible
+        inside += hit
+        colours += pixels[row, column] / 255 * hit[:, None]
+    share = (inside / seen.clamp(min=1)).clamp(min=1e-3)
+    rows = torch.multinomial(share.pow(SHARPNESS), count, generator=generator)
+    mean_colours = colours / inside.clamp(min=1)[:, None]
+    return Points(candidates[rows], torch.where(inside[rows, None] > 0, mean_colours[rows], 0.5))
+
+
+def _pixels_of(
+    points: Tensor, camera: Camera, stride: int, size: torch.Size
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return which points (P, 3) the picture shows, and the row and column they fall on."""
+    rotation = torch.as_tensor(camera.rotation, dtype=points.dtype)
+    at = points @ rotation.T + torch.as_tensor(camera.translation, dtype=points.dtype)
+    depth = at[:, 2].clamp(min=1e-6)
+    column = ((at[:, 0] / depth * camera.fx + camera.cx) / stride).floor().long()
+    row = ((at[:, 1] / depth * camera.fy + camera.cy) / stride).floor().long()
+    visible = (at[:, 2] > 0) & (row >= 0) & (row < size[0]) & (column >= 0) & (column < size[1])
+    return visible, row.clamp(0, size[0] - 1), column.clamp(0, size[1] - 1)
