@@ -28,7 +28,7 @@ def orbit(cameras: Sequence[Camera], centre: Vector, count: int) -> list[Camera]
         centre: (3,) what is looked at [world units].
         count: number of cameras; the last stands one step before the first.
     """
-    first, up = cameras[0], mean_up(cameras)
+    first, up = cameras[0], common_up(cameras)
     offsets = np.stack([camera.centre - centre for camera in cameras])
     distances = np.linalg.norm(offsets, axis=1)
     distance = max(float(distances.mean()), 1e-3)
@@ -46,11 +46,20 @@ def orbit(cameras: Sequence[Camera], centre: Vector, count: int) -> list[Camera]
     return result
 
 
-def mean_up(cameras: Sequence[Camera]) -> Vector:
-    """Return the (3,) unit vector that is up on average; z if the cameras have no common up."""
+def common_up(cameras: Sequence[Camera]) -> Vector:
+    """Return the (3,) unit vector that is up for all cameras.
+
+    Cameras held level have their x axis at a right angle to it, whichever way they look; where
+    that leaves a choice, or the cameras were not held level, the mean of their ups is taken, and z
+    if there is none.
+    """
     total = -np.sum([camera.rotation[1] for camera in cameras], axis=0)
     length = float(np.linalg.norm(total))
-    return total / length if length > 1e-6 else np.array([0.0, 0.0, 1.0])
+    mean = total / length if length > 1e-6 else np.array([0.0, 0.0, 1.0])
+    right = np.stack([camera.rotation[0] for camera in cameras])
+    spread, axes = np.linalg.eigh(right.T @ right / len(right))
+    level = axes[:, 0] * np.sign(axes[:, 0] @ mean)
+    return level if spread[0] < 0.01 < 0.1 < spread[1] and level @ mean > 0.7 else mean
 
 
 def _perpendicular(vector: Vector, axis: Vector) -> Vector:

@@ -7,6 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from gsdmsr_cli.synthetic import write_scene
+
 
 @pytest.fixture(scope="session")
 def shared_data() -> Path:
@@ -18,3 +20,11 @@ def shared_data() -> Path:
     if not folder.is_dir():
         pytest.skip(f"GSDMSR_DATA={value} is not a folder")
     return folder.resolve()
+
+
+@pytest.fixture(scope="session")
+def tiny_scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder of a moving scene of 48 x 48 px in D-NeRF layout: 12 train, 3 val, 4 test views."""
+    folder = tmp_path_factory.mktemp("data") / "tiny"
+    write_scene(folder, size=48, train=12, val=3, test=4)
+    return folder

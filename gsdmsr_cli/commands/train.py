@@ -20,9 +20,10 @@ from gsdmsr_cli.formats import read_scene
 from gsdmsr_cli.kernels.jit import set_threads
 from gsdmsr_cli.pictures import Pictures
 from gsdmsr_cli.preset import Preset, load_preset
-from gsdmsr_cli.run import SCHEMA, Run, continue_run, create_run, open_run, refuse_used
+from gsdmsr_cli.run import SCHEMA, Checkpoint, Run, continue_run, create_run, open_run, refuse_used
 from gsdmsr_cli.scene import Scene
 from gsdmsr_cli.training.loop import train
+from gsdmsr_cli.training.schedule import new_clock
 from gsdmsr_cli.training.trainer import BACKGROUNDS, Trainer
 from gsdmsr_cli.training.warm_up import warm_up
 
@@ -56,6 +57,8 @@ def run(
         options = load_preset(preset, config, overrides)
     else:
         options = _resumed_options(earlier, preset, config, overrides)
+        checkpoint = earlier.load()
+        _require_rest(earlier, options, checkpoint)
     where = raster.pick_device(device)
     scene, load_s = _timed(lambda: read_scene(data))
     if earlier is not None:
@@ -66,8 +69,7 @@ def run(
         name = preset or (config.name if config else "default")
         folder = create_run(out, name, options, trainer.facts, scene, overwrite)
     else:
-        trainer.restore(earlier.load())
-        _require_rest(earlier, trainer)
+        trainer.restore(checkpoint)
         folder = continue_run(earlier, options, scene)
         folder.rewind_log(trainer.clock.step)
     with TrainingDisplay() as display:
@@ -127,8 +129,9 @@ def _resumed_options(
     return asked
 
 
-def _require_rest(earlier: Run, trainer: Trainer) -> None:
-    clock = trainer.clock
+def _require_rest(earlier: Run, options: Preset, checkpoint: Checkpoint) -> None:
+    clock = new_clock(options.training)
+    clock.step, clock.before = checkpoint.step, checkpoint.elapsed
     if clock.progress >= 1:
         raise UsageError(
             f"{earlier.root}: is complete at step {clock.step} after {clock.elapsed:.0f} s; "

@@ -24,7 +24,7 @@ BOUND = 1.5
 def scene_of(points: np.ndarray | None = None, bound: float = BOUND) -> Scene:
     points = np.zeros((0, 3), np.float32) if points is None else points.astype(np.float32)
     colours = np.random.default_rng(0).random(points.shape, np.float32)
-    return Scene(Path("."), "test", (), points, colours, None, bound, "")
+    return Scene(Path(), "test", (), points, colours, None, bound, "")
 
 
 def start(scene: Scene, seed: int = 0, **options: Any) -> Splats:
