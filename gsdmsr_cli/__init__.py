@@ -4,6 +4,6 @@ import os
 
 __version__ = "0.1.0"
 
-# Threads of torch's and Numba's OpenMP that spin between kernels starve each other on few cores
-# (8 ms a launch instead of 0.04 on two); the runtime reads this once, before its first use.
+# Where OpenMP runs the kernels its threads must not spin between them: on few cores they starve
+# each other (8 ms a launch instead of 0.04 on two). The runtime reads this once, when it is loaded.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")

@@ -5,9 +5,14 @@ from __future__ import annotations
 import errno
 import json
 import os
+import signal
 import sys
+import threading
 import traceback
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from types import FrameType
 from typing import Annotated, Literal, cast
 
 import typer
@@ -224,7 +229,8 @@ def main() -> None:
 
 def _run() -> int:
     try:
-        result = typer.main.get_command(app).main(prog_name="gsdmsr", standalone_mode=False)
+        with _ctrl_c_that_spares_imports():
+            result = typer.main.get_command(app).main(prog_name="gsdmsr", standalone_mode=False)
     except (KeyboardInterrupt, typer.Abort):
         return 130
     except BrokenPipeError:
@@ -241,15 +247,37 @@ def _run() -> int:
     return result if isinstance(result, int) else 0
 
 
+@contextmanager
+def _ctrl_c_that_spares_imports() -> Iterator[None]:
+    """Let Ctrl-C raise KeyboardInterrupt, but not in an import: the core of torch would abort."""
+    if threading.current_thread() is not threading.main_thread():
+        yield  # where Python allows no handlers
+        return
+    before = signal.signal(signal.SIGINT, _interrupt)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def _interrupt(_number: int, frame: FrameType | None) -> None:
+    while frame is not None:
+        if frame.f_globals.get("__name__") == "importlib._bootstrap":
+            os._exit(130)  # nothing has been begun that would have to be cleared away
+        frame = frame.f_back
+    raise KeyboardInterrupt
+
+
 def _explain(error: Exception) -> tuple[str, int]:
     """Return the one-line message and the exit code of an error."""
     if isinstance(error, GsdmsrError):
         return str(error), error.exit_code
     if isinstance(error, _CommandLineError):
-        return error.format_message() or "missing command; see --help", UsageError.exit_code
+        message = error.format_message().replace("Value error, ", "")
+        return message or "missing command; see --help", UsageError.exit_code
     if isinstance(error, OSError) and error.errno in _MACHINE_ERRNOS:
         where = f"{error.filename}: " if error.filename else ""
-        return f"{where}{error.strerror}", 3
+        return f"{where}{error.strerror}; free space or choose another place", 3
     hint = "set GSDMSR_DEBUG=1 for the traceback"
     return f"internal: {type(error).__name__}: {error} ({hint})", 1
 

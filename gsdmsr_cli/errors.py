@@ -7,7 +7,7 @@ from collections.abc import Iterable
 
 
 class GsdmsrError(Exception):
-    """An error whose message is one line that says what was found, what is allowed and what to do."""
+    """An error whose message is one line: what was found, what is allowed and what to do."""
 
     exit_code = 1
 
@@ -31,7 +31,7 @@ class ThresholdError(GsdmsrError):
 
 
 def nearest(word: str, known: Iterable[str]) -> str:
-    """Return a clause naming the known word closest to ``word``, or all of them if none is close."""
+    """Return a clause naming the known word closest to ``word``, or all if none is close."""
     known = sorted(known)
     close = difflib.get_close_matches(word, known, n=1, cutoff=0.5)
     return f"did you mean '{close[0]}'?" if close else f"known: {', '.join(known) or 'none'}"

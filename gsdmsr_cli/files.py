@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 from collections.abc import Mapping
 from pathlib import Path
@@ -24,7 +25,10 @@ def write_json(path: Path, document: Mapping[str, Any]) -> None:
         beside.write_text(text, encoding="utf-8")
         beside.replace(path)
     except OSError as error:
-        raise DataError(f"{path}: cannot be written: {error.strerror or error}") from error
+        with contextlib.suppress(OSError):
+            beside.unlink()
+        reason = error.strerror or error
+        raise DataError(f"{path}: cannot be written: {reason}; is the disk full?") from error
 
 
 def read_json(path: Path) -> dict[str, Any]:

@@ -6,6 +6,7 @@ import contextlib
 import os
 import struct
 import uuid
+import zlib
 from collections.abc import Iterable, Iterator
 from itertools import chain
 from pathlib import Path
@@ -31,7 +32,7 @@ def read_image(path: Path) -> NDArray[np.uint8]:
     Raises:
         DataError: the file is missing, truncated, damaged or not a picture.
     """
-    source = _open(path)
+    source = _open(path, thorough=True)
     pixels = source.read_image(OpenImageIO.UINT8)
     # A truncated JPEG decodes with its missing rows in grey and tells so only in the error text.
     message = source.geterror()
@@ -114,18 +115,22 @@ def write_webm(path: Path, frames: Iterable[NDArray[np.uint8]], fps: float) -> N
         written = _encode(temporary, chain([first], frames), first.shape, fps)
         # OpenCV drops what it could not write without a word, so count what is really there.
         if _count_frames(temporary) != written:
-            raise DataError(f"cannot write {path}: the file is incomplete; is the disk full?")
+            height, width, _ = first.shape
+            raise DataError(
+                f"cannot write {path}: the video is incomplete; is the disk full, or are pictures "
+                f"of {width} x {height} px too small for VP8?"
+            )
 
 
-def _open(path: Path) -> OpenImageIO.ImageInput:
+def _open(path: Path, thorough: bool = False) -> OpenImageIO.ImageInput:
     try:
         if not path.is_file():
             raise DataError(f"image {path} does not exist or is not a file")
-        truncated = _is_truncated_png(path)
+        fault = _png_fault(path, thorough)
     except OSError as error:
         raise DataError(f"image {path} cannot be read: {error.strerror or error}") from error
-    if truncated:
-        raise DataError(_unreadable(path, "the PNG ends too early"))
+    if fault:
+        raise DataError(_unreadable(path, fault))
     # Without this hint OpenImageIO premultiplies by alpha, in 8 bits.
     config = OpenImageIO.ImageSpec()
     config["oiio:UnassociatedAlpha"] = 1
@@ -135,20 +140,28 @@ def _open(path: Path) -> OpenImageIO.ImageInput:
     return source
 
 
-def _is_truncated_png(path: Path) -> bool:
-    """Tell whether ``path`` is a PNG whose chunks do not reach the end marker.
+def _png_fault(path: Path, thorough: bool) -> str | None:
+    """Return what is wrong with a PNG's chunks: no end marker or, if thorough, a wrong checksum.
 
     The decoder would notice too, but only with the pixels, and libpng then prints to stderr.
     """
     with path.open("rb") as file:
+        size = os.fstat(file.fileno()).st_size
         if file.read(8) != _PNG_SIGNATURE:
-            return False
+            return None
         while len(header := file.read(8)) == 8:
             length, kind = struct.unpack(">I4s", header)
             if kind == b"IEND":
-                return False
-            file.seek(length + 4, os.SEEK_CUR)
-    return True
+                return None
+            end = file.tell() + length + 4
+            if end > size:
+                break
+            if thorough and zlib.crc32(kind + file.read(length)) != int.from_bytes(
+                file.read(4), "big"
+            ):
+                return "a checksum in the PNG is wrong"
+            file.seek(end)
+    return "the PNG ends too early"
 
 
 def _unreadable(path: Path, message: str) -> str:
@@ -197,11 +210,12 @@ def _encode(
 
 
 def _count_frames(path: Path) -> int:
-    capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
     count = 0
-    while capture.grab():
-        count += 1
-    capture.release()
+    with _silent_stderr():  # FFmpeg tells of a file that is cut short
+        capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
+        while capture.grab():
+            count += 1
+        capture.release()
     return count
 
 

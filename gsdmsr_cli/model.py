@@ -61,7 +61,7 @@ def load_model(
         splats = Splats(**{name.removeprefix(STORED_AS): t for name, t in stored.items()})
     except (TypeError, ValueError) as error:
         raise DataError(f"the checkpoint's splats cannot be used: {error}") from error
-    model = Model(splats, start_motion(settings, facts, torch.Generator()))
+    model = Model(splats, start_motion(settings, facts, len(splats), torch.Generator()))
     model.motion.advance(progress)
     with torch.no_grad():
         for name, tensor in model.motion.tensors().items():

@@ -12,11 +12,12 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from gsdmsr_cli import imaging
 from gsdmsr_cli.camera import Camera
-from gsdmsr_cli.errors import DataError
+from gsdmsr_cli.errors import DataError, UsageError
 from gsdmsr_cli.scene import View
 
 _Key = tuple[Path, int, int]
@@ -46,7 +47,11 @@ class Pictures:
         self._lock = threading.Lock()
 
     def camera(self, view: View) -> Camera:
-        """Return the camera of the picture that ``load`` returns."""
+        """Return the camera of the picture that ``load`` returns.
+
+        Raises:
+            UsageError: the pictures are too small to be divided by ``downscale``.
+        """
         return view.camera.resized(*self._size(view))
 
     def load(self, view: View) -> Tensor:
@@ -54,6 +59,7 @@ class Pictures:
 
         Raises:
             DataError: the file cannot be read or has another size than the view's camera.
+            UsageError: as ``camera``.
         """
         key = (view.image_path, view.camera.width, view.camera.height)
         with self._lock:
@@ -81,7 +87,7 @@ class Pictures:
             progress: called with (done, total) after each picture.
 
         Raises:
-            DataError: as ``load``.
+            DataError, UsageError: as ``load``.
         """
         views = list(views)
         ends = accumulate(3 * width * height for width, height in map(self._size, views))
@@ -93,10 +99,12 @@ class Pictures:
 
     def _size(self, view: View) -> tuple[int, int]:
         width, height = view.camera.width, view.camera.height
-        return (
-            max(1, round(width / self._downscale)),
-            max(1, round(height / self._downscale)),
-        )
+        if self._downscale > min(width, height):
+            raise UsageError(
+                f"downscale {self._downscale} leaves nothing of pictures of {width} x {height} px, "
+                f"such as {view.image_path}; allowed: 1 to {min(width, height)}"
+            )
+        return round(width / self._downscale), round(height / self._downscale)
 
     def _decode(self, view: View) -> Tensor:
         image = imaging.read_image(view.image_path)
@@ -109,8 +117,7 @@ class Pictures:
         pixels = imaging.composite(image, self._background)
         if self._downscale > 1:
             pixels = imaging.resize_area(pixels, *self._size(view))
-        planes = np.rint(pixels * 255).clip(0, 255).astype(np.uint8).transpose(2, 0, 1)
-        return torch.from_numpy(np.ascontiguousarray(planes))
+        return _planes(pixels * 255)
 
 
 class HalvedPictures:
@@ -134,8 +141,12 @@ class HalvedPictures:
         key = view.split, view.name
         if key not in self._halved:
             camera = self.camera(view)
-            whole = self._pictures.load(view)[None].float()
-            size = (camera.height, camera.width)
-            small = torch.nn.functional.interpolate(whole, size, mode="area")[0]
-            self._halved[key] = small.round().to(torch.uint8)
+            whole = self._pictures.load(view).permute(1, 2, 0).numpy().astype(np.float32)
+            self._halved[key] = _planes(imaging.resize_area(whole, camera.width, camera.height))
         return self._halved[key]
+
+
+def _planes(pixels: NDArray[np.float32]) -> Tensor:
+    """Return (H, W, 3) pixels in [0, 255] as (3, H, W) uint8."""
+    planes = np.rint(pixels).clip(0, 255).astype(np.uint8).transpose(2, 0, 1)
+    return torch.from_numpy(np.ascontiguousarray(planes))

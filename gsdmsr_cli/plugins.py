@@ -10,7 +10,7 @@ from gsdmsr_cli.errors import UsageError, nearest
 
 
 def names(package: str) -> list[str]:
-    """Return the names of the plug-ins in ``package``, sorted; modules that start with _ are not."""
+    """Return the sorted names of the plug-ins in ``package``; modules with a leading _ are none."""
     paths = importlib.import_module(package).__path__
     return sorted(m.name for m in pkgutil.iter_modules(paths) if not m.name.startswith("_"))
 

@@ -107,7 +107,6 @@ class TrainingOptions:
         steps: length of the training [steps], unless there is a budget.
         budget: length of the training as wall time, such as "8m"; null counts steps.
         static_until: progress up to which nothing moves.
-        coarse_until: progress up to which only the coarse part of the motion learns.
         views_per_step: pictures drawn and compared per step.
         low_resolution_until: progress up to which pictures of half the size are drawn; 0 is never.
         checkpoint_minutes: time between checkpoints [min].
@@ -118,7 +117,6 @@ class TrainingOptions:
     steps: int = 10000
     budget: str | None = None
     static_until: float = 0.08
-    coarse_until: float = 0.12
     views_per_step: int = 1
     low_resolution_until: float = 0.0
     checkpoint_minutes: float = 2.0
@@ -129,9 +127,7 @@ class TrainingOptions:
         _require_at_least(self, 1, "steps", "views_per_step")
         known = self.budget is None or _duration(self.budget) is not None
         require(self, "budget", known, f"null or {_DURATION}")
-        _require_progress(self, "static_until", "coarse_until", "low_resolution_until")
-        least = f"training.static_until ({self.static_until:g}) or more"
-        require(self, "coarse_until", self.coarse_until >= self.static_until, least)
+        _require_progress(self, "static_until", "low_resolution_until")
         _require_positive(self, "checkpoint_minutes")
         require(self, "seed", 0 <= self.seed < 2**32, "0 to 4294967295")
         _require_at_least(self, 0, "threads")

@@ -136,12 +136,17 @@ def _merge(base: Located, over: Located) -> Located:
     """Return ``base`` with the keys of ``over``, nested mappings merged.
 
     A mapping that carries another ``name`` replaces: the options of a plug-in are its own.
+
+    Raises:
+        UsageError: ``base`` has a single value where ``over`` has a mapping.
     """
     merged = Located(base, base.places | over.places)
     for key, value in over.items():
         old = base.get(key)
         if isinstance(old, Located) and isinstance(value, Located) and not _renames(old, value):
             value = _merge(old, value)
+        elif key in base and isinstance(value, Located) and not isinstance(old, Located):
+            raise UsageError(f"{base.places[key]}: {key} is {old!r}; allowed: a mapping")
         merged[key] = value
     return merged
 

@@ -12,6 +12,7 @@ earlier one. The folder can be moved; nothing in it is pickled.
 from __future__ import annotations
 
 import json
+import os
 import shutil
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
@@ -24,7 +25,7 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from gsdmsr_cli import __version__, strict
-from gsdmsr_cli.errors import DataError, UsageError
+from gsdmsr_cli.errors import DataError, GsdmsrError, UsageError
 from gsdmsr_cli.files import read_json, write_json
 from gsdmsr_cli.model import Model, load_model
 from gsdmsr_cli.motion import Facts
@@ -128,7 +129,9 @@ class Run:
             return
         lines = self.log_path.read_text(encoding="utf-8").splitlines(keepends=True)
         kept = [line for line in lines if _is_up_to(step, line)]
-        self.log_path.write_text("".join(kept), encoding="utf-8")
+        beside = self.log_path.with_suffix(".part")
+        beside.write_text("".join(kept), encoding="utf-8")
+        beside.replace(self.log_path)
 
     def save(self, checkpoint: Checkpoint) -> None:
         """Replace the last checkpoint."""
@@ -146,7 +149,9 @@ class Run:
             beside.replace(self.checkpoint_path)
         except (OSError, SafetensorError) as error:
             beside.unlink(missing_ok=True)
-            raise DataError(f"{self.checkpoint_path}: cannot be written: {error}") from error
+            raise DataError(
+                f"{self.checkpoint_path}: cannot be written: {error}; is the disk full?"
+            ) from error
 
     def load(self) -> Checkpoint:
         """Read the last checkpoint.
@@ -170,12 +175,22 @@ class Run:
                 dict(state["state"]),
             )
         except (SafetensorError, OSError, KeyError, TypeError, ValueError) as error:
-            raise DataError(f"{self.checkpoint_path}: damaged checkpoint: {error}") from error
+            raise DataError(
+                f"{self.checkpoint_path}: damaged checkpoint: {error}; train again with --overwrite"
+            ) from error
 
     def load_model(self) -> tuple[Model, Checkpoint]:
-        """Read the model of the last checkpoint, for drawing."""
+        """Read the model of the last checkpoint, for drawing.
+
+        Raises:
+            DataError: there is none, or it is not what the run's description says.
+        """
         checkpoint = self.load()
-        model = load_model(checkpoint.tensors, self.preset.motion, self.facts, checkpoint.progress)
+        settings = self.preset.motion
+        try:
+            model = load_model(checkpoint.tensors, settings, self.facts, checkpoint.progress)
+        except GsdmsrError as error:
+            raise DataError(f"{self.root}: its model cannot be loaded: {error}") from error
         for tensor in model.tensors().values():
             tensor.requires_grad_(False)
         return model, checkpoint
@@ -183,9 +198,12 @@ class Run:
 
 def refuse_used(root: Path, overwrite: bool) -> None:
     """Raise DataError unless a run may be started in the folder ``root``."""
-    if not root.exists() or (root.is_dir() and not any(root.iterdir())):
+    if not root.exists():
+        _require_place(root)
         return
-    if not (root / _ABOUT).is_file():
+    if root.is_dir() and not any(root.iterdir()):
+        return
+    if not _describes_a_run(root / _ABOUT):
         raise DataError(f"{root}: exists and is not a run folder; choose another --out")
     if not overwrite:
         raise DataError(
@@ -207,7 +225,7 @@ def create_run(
     if data.is_relative_to(root.resolve()):
         raise DataError(f"{root}: holds the data {scene.root}; choose another --out")
     if root.exists():
-        shutil.rmtree(root)
+        _clear(root)
     run = Run(root, name, preset, facts, data, scene.layout, scene.fingerprint)
     run.describe()
     return run
@@ -220,6 +238,8 @@ def continue_run(run: Run, preset: Preset, scene: Scene) -> Run:
         DataError: the scene is not the run's, or the folder cannot be written.
     """
     run.check_scene(scene)
+    for left in (*run.root.glob(".tmp*"), *run.root.glob("*.part")):
+        left.unlink()  # a killed training was writing them
     continued = replace(run, preset=preset, data=scene.root.resolve())
     continued.describe()
     return continued
@@ -241,14 +261,39 @@ def open_run(root: Path) -> Run:
         return Run(
             root,
             str(about["name"]),
-            strict.build(Preset, about["preset"], str(path)),
-            strict.build(Facts, about["facts"], str(path)),
+            strict.build(Preset, about["preset"], "preset"),
+            strict.build(Facts, about["facts"], "facts"),
             Path(about["data"]["path"]),
             str(about["data"]["layout"]),
             str(about["data"]["fingerprint"]),
         )
     except (UsageError, LookupError, TypeError, AttributeError) as error:
         raise DataError(f"{path}: damaged: {error}") from error
+
+
+def _clear(root: Path) -> None:
+    """Empty the folder of a run; the folder itself, which may be a link or a mount, stays."""
+    for entry in root.iterdir():
+        if entry.is_dir() and not entry.is_symlink():
+            shutil.rmtree(entry)
+        else:
+            entry.unlink()
+
+
+def _describes_a_run(path: Path) -> bool:
+    """Tell whether ``path`` is a run's description, not just any file of its name."""
+    try:
+        return "gsdmsr" in read_json(path)
+    except DataError:
+        return False
+
+
+def _require_place(root: Path) -> None:
+    """Raise DataError unless the folder ``root``, which is not there yet, can be made."""
+    nearest = next(parent for parent in root.absolute().parents if parent.exists())
+    if not nearest.is_dir() or not os.access(nearest, os.W_OK):
+        problem = "cannot be written" if nearest.is_dir() else "is a file"
+        raise DataError(f"{root}: cannot be made, since {nearest} {problem}; choose another --out")
 
 
 def _is_up_to(step: int, line: str) -> bool:

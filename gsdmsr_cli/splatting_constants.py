@@ -1,4 +1,4 @@
-"""The constants of splatting, one place for every engine (values as in 3DGS, Kerbl et al. 2023, except where said)."""
+"""The constants of splatting, for every engine; as in 3DGS (Kerbl et al. 2023) unless said."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ TRANSMITTANCE_STOP = 1e-4
 long as others of the same tile are unfinished; the difference is below this value."""
 
 FRUSTUM_MARGIN = 1.3
-"""x/z and y/z are clamped to this multiple of the half image in the projection's Jacobian (3DGS)."""
+"""The projection's Jacobian clamps x/z and y/z to this multiple of the half image (3DGS)."""
 
 TILE = 16
 """Edge of a tile [px] in engines that have tiles."""

@@ -25,9 +25,9 @@ def splats_of(count: int, seed: int = 0) -> Splats:
     )
 
 
-def started(name: str, **options: Any) -> Motion:
-    """Return the motion as training starts with it."""
-    return start_motion({"name": name, **options}, FACTS, generator())
+def started(name: str, count: int = 1, **options: Any) -> Motion:
+    """Return the motion as training starts it with so many splats."""
+    return start_motion({"name": name, **options}, FACTS, count, generator())
 
 
 def disturbed(motion: Motion) -> Motion:

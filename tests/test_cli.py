@@ -194,9 +194,13 @@ def test_usage_errors_are_one_line_and_exit_2(
         (
             OSError(errno.ENOSPC, "No space left on device", "r/a"),
             3,
-            "r/a: No space left on device",
+            "r/a: No space left on device; free space or choose another place",
         ),
-        (PermissionError(errno.EACCES, "Permission denied"), 3, "Permission denied"),
+        (
+            PermissionError(errno.EACCES, "Permission denied"),
+            3,
+            "Permission denied; free space or choose another place",
+        ),
         (
             ZeroDivisionError("division by zero"),
             1,

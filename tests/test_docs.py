@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib
-import inspect
 import re
 import sys
 from collections.abc import Iterator
@@ -33,12 +32,6 @@ from gsdmsr_cli.training.trainer import Trainer
 ROOT = Path(__file__).parent.parent
 PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").glob("*.md")])
 COMMANDS = ("train", "eval", "render", "export", "demo", "doctor", "benchmark")
-
-knows_the_count = pytest.mark.xfail(
-    "count" not in inspect.signature(start_motion).parameters,
-    reason="start_motion does not tell a motion the number of splats yet",
-    strict=True,
-)
 
 
 def example(page: str) -> str:
@@ -78,11 +71,9 @@ def splats_of(count: int) -> Splats:
 
 
 def started(settings: dict[str, Any], count: int) -> Any:
-    start: Any = start_motion
-    return start(settings, Facts(1.3, 10), count, generator())
+    return start_motion(settings, Facts(1.3, 10), count, generator())
 
 
-@knows_the_count
 def test_the_example_of_a_motion_keeps_to_the_rules(linear: ModuleType) -> None:
     splats, motion = splats_of(5), started({"name": "linear"}, 5)
     assert torch.equal(motion.at(splats, 0.9).means, splats.means)
@@ -98,7 +89,6 @@ def test_the_example_of_a_motion_keeps_to_the_rules(linear: ModuleType) -> None:
         started({"name": "linear", "slownes": 1.0}, 5)
 
 
-@knows_the_count
 def test_the_example_of_a_motion_is_saved_and_loaded(linear: ModuleType) -> None:
     model = Model(splats_of(5), started({"name": "linear"}, 5))
     with torch.no_grad():
@@ -109,14 +99,13 @@ def test_the_example_of_a_motion_is_saved_and_loaded(linear: ModuleType) -> None
     assert torch.equal(loaded.at(0.2).means, model.at(0.2).means)
 
 
-@knows_the_count
 def test_the_example_of_a_motion_trains_and_grows(linear: ModuleType, tmp_path: Path) -> None:
     data = tmp_path / "scene"
     write_scene(data, size=32, train=6, val=1, test=1)
     options = [
         "motion={name: linear}", "splats.count=150", "training.steps=40", "density.start=10",
         "density.every=10", "density.until=1.0", "density.gradient=1e-9", "density.cap=400",
-        "density.reset_at=[]", "training.static_until=0.1", "training.coarse_until=0.1",
+        "density.reset_at=[]", "training.static_until=0.1",
     ]  # fmt: skip
     preset = load_preset("dnerf", None, options)
     pictures = Pictures((1.0, 1.0, 1.0), 1, 1 << 28)

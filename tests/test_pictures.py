@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,7 @@ from datasets import noise, write_picture
 from gsdmsr_cli import imaging
 from gsdmsr_cli.camera import Camera
 from gsdmsr_cli.errors import DataError
-from gsdmsr_cli.pictures import Pictures
+from gsdmsr_cli.pictures import HalvedPictures, Pictures
 from gsdmsr_cli.scene import View
 
 WHITE = (1.0, 1.0, 1.0)
@@ -147,3 +148,40 @@ def test_many_threads_get_the_same_pictures(views: list[View]) -> None:
 def test_downscale_below_one_is_a_mistake() -> None:
     with pytest.raises(ValueError, match="downscale"):
         Pictures(WHITE, 0, 1)
+
+
+@pytest.mark.parametrize(("width", "height"), [(9, 6), (8, 8), (1, 5), (1, 1)])
+def test_halved_pictures_have_the_cameras_of_their_size(
+    tmp_path: Path, width: int, height: int
+) -> None:
+    write_picture(tmp_path / "a.png", np.full((height, width, 3), 77, np.uint8))
+    view = make_view(tmp_path / "a.png", width, height)
+    halved = HalvedPictures(Pictures(WHITE, 1, 10**6))
+    picture, camera = halved.load(view), halved.camera(view)
+    assert (camera.width, camera.height) == (max(1, width // 2), max(1, height // 2))
+    assert camera.fx == pytest.approx(20 * camera.width / width)
+    assert camera.cy == pytest.approx(camera.height / 2)
+    assert torch.equal(picture, torch.full((3, camera.height, camera.width), 77).byte())
+
+
+@pytest.mark.parametrize("downscale", [1, 2])
+def test_halved_pictures_are_means_of_two_by_two(tmp_path: Path, downscale: int) -> None:
+    write_picture(tmp_path / "a.png", noise(16, 24, seed=4))
+    view, pictures = make_view(tmp_path / "a.png", 24, 16), Pictures(WHITE, downscale, 10**6)
+    whole = pictures.load(view).double()
+    _, h, w = whole.shape
+    expected = whole.reshape(3, h // 2, 2, w // 2, 2).mean(dim=(2, 4))
+    found = HalvedPictures(pictures).load(view)
+    assert found.dtype == torch.uint8 and found.is_contiguous()
+    assert (found.double() - expected).abs().max() <= 0.5
+
+
+def test_halved_pictures_are_made_once_and_kept_by_split(
+    views: list[View], decoded: Counter[str]
+) -> None:
+    halved = HalvedPictures(Pictures(WHITE, 1, 0))
+    twin = replace(views[1], name=views[0].name, split="val")
+    assert halved.load(views[0]) is halved.load(views[0])
+    assert not torch.equal(halved.load(views[0]), halved.load(twin))
+    halved.load(twin)
+    assert decoded == {"0": 1, "1": 1}

@@ -25,8 +25,9 @@ def cloud(count: int, seed: int = 0) -> Splats:
     rng = np.random.default_rng(seed)
 
     def on_sphere(n: int) -> np.ndarray:
-        directions = rng.normal(size=(n, 3))
-        return directions / np.linalg.norm(directions, axis=1, keepdims=True)
+        directions: np.ndarray = rng.normal(size=(n, 3))
+        directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+        return directions
 
     shell = rng.integers(0, SHELLS, count)
     centres = rng.normal(size=(SHELLS, 3)) * 0.25

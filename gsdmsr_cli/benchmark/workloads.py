@@ -45,7 +45,8 @@ def drawing(size: int, count: int) -> Callable[[], None]:
 
 def training_step(size: int, count: int, motion: str) -> Callable[[], None]:
     """Return a function that makes a training step at rate 0: L1 + SSIM, one view."""
-    model = Model(cloud(count), start_motion({"name": motion}, Facts(1.0, FRAMES), _generator()))
+    moving = start_motion({"name": motion}, Facts(1.0, FRAMES), count, _generator())
+    model = Model(cloud(count), moving)
     model.motion.advance(1.0)
     engine, view, background = best_engine("cpu"), camera(size), torch.ones(3)
     target = target_of(draw(model, view, TIME, engine, background).rgb)

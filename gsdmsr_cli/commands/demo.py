@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 
 from rich.console import Console
@@ -9,7 +10,7 @@ from rich.console import Console
 from gsdmsr_cli.commands import eval as evaluate
 from gsdmsr_cli.commands import render, train
 from gsdmsr_cli.commands._progress import progress_bar
-from gsdmsr_cli.errors import UsageError
+from gsdmsr_cli.errors import DataError, UsageError
 from gsdmsr_cli.synthetic import write_scene
 
 BUDGET = "60s"
@@ -24,8 +25,8 @@ def run(out: Path) -> None:
 
     Raises:
         UsageError: ``out`` is a file, or a folder with something else in it.
+        DataError: ``out`` cannot be written.
     """
-    console = Console()
     _claim(out)
     scene, run_folder = out / "scene", out / "run"
     _write_scene(scene)
@@ -33,7 +34,7 @@ def run(out: Path) -> None:
     train.run(scene, run_folder, "dnerf", None, overrides, "auto", False, run_folder.exists())
     evaluate.run(run_folder, "test", None, None, None, False, [])
     render.run(run_folder, None, None, None)
-    console.print(_where_to_look(scene, run_folder), soft_wrap=True, markup=False, highlight=False)
+    Console().out(_where_to_look(scene, run_folder), highlight=False)
 
 
 def _claim(out: Path) -> None:
@@ -42,8 +43,12 @@ def _claim(out: Path) -> None:
         raise UsageError(f"{out}: is a file; --out names a folder")
     if out.is_dir() and any(out.iterdir()) and not (out / MARKER).is_file():
         raise UsageError(f"{out}: is neither empty nor an earlier demo; choose another --out")
-    out.mkdir(parents=True, exist_ok=True)
-    (out / MARKER).touch()
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        (out / MARKER).touch()
+    except OSError as error:
+        reason = error.strerror or error
+        raise DataError(f"{out}: cannot be made: {reason}; choose another --out") from error
 
 
 def _write_scene(folder: Path) -> None:
@@ -56,5 +61,6 @@ def _where_to_look(scene: Path, run_folder: Path) -> str:
     places += [("video", path) for path in sorted(run_folder.rglob("*.webm"))]
     places += [("scores", run_folder / "eval" / "metrics.json")]
     lines = [f"  {what}: {path}" for what, path in places]
-    export = f"gsdmsr export {run_folder} --format ply --time 0.5 --out half.ply"
+    folder = shlex.quote(str(run_folder))
+    export = f"gsdmsr export {folder} --format ply --time 0.5 --out half.ply"
     return "\n".join(["Where to look", *lines, f"  for a splat viewer: {export}"])

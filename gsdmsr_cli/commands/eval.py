@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from gsdmsr_cli import machine
@@ -57,7 +58,8 @@ def run(
     if as_json:
         Console().out(json.dumps(document), highlight=False)
     else:
-        Console().print(_table(document), f"written to {path}", soft_wrap=True, highlight=False)
+        Console().print(_table(document))
+        Console().out(f"written to {path}", highlight=False)
     _check(document["aggregate"], thresholds)
 
 
@@ -178,7 +180,7 @@ def _table(document: Mapping[str, Any]) -> Table:
     for metric in _METRICS:
         value = _value(aggregate, metric)
         reason = "" if value is not None else _reason(aggregate[metric])
-        table.add_row(metric, f"{value:.4f}" if value is not None else f"none: {reason}")
+        table.add_row(metric, f"{value:.4f}" if value is not None else f"none: {escape(reason)}")
     train = document["aggregate_train"]["psnr"]
     table.add_row("psnr of train views", "none" if train is None else f"{train:.4f}")
     table.add_row("frames a second", f"{document['speed']['fps']:.1f}")

@@ -36,4 +36,4 @@ def run(run_folder: Path, format_: str, time: float | None, frames: int | None, 
         written = exporter.export(model, out, options)
     count, splats = len(written), len(model.splats)
     what = f"{out}" if count == 1 else f"{out}, {count} files"
-    Console().print(f"wrote {what}: {splats} splats", soft_wrap=True, highlight=False)
+    Console().out(f"wrote {what}: {splats} splats", highlight=False)

@@ -77,7 +77,7 @@ def run(
             pictures = _draw(trained, film, target / film.name, tell)
             write_webm(target / f"{film.name}.webm", pictures, film.fps)
         text = f"wrote {target / film.name}.webm and {len(film.shots)} pictures beside it"
-        Console().print(text, soft_wrap=True, highlight=False)
+        Console().out(text, highlight=False)
 
 
 def _test(trained: Trained) -> Film:

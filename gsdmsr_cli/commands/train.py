@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -53,8 +54,8 @@ def run(
     """
     earlier = open_run(out) if resume else None
     if earlier is None:
-        refuse_used(out, overwrite)
         options = load_preset(preset, config, overrides)
+        refuse_used(out, overwrite)
     else:
         options = _resumed_options(earlier, preset, config, overrides)
         checkpoint = earlier.load()
@@ -68,6 +69,7 @@ def run(
     if earlier is None:
         name = preset or (config.name if config else "default")
         folder = create_run(out, name, options, trainer.facts, scene, overwrite)
+        folder.save(trainer.checkpoint())  # a disk without room is told of now, not at the end
     else:
         trainer.restore(checkpoint)
         folder = continue_run(earlier, options, scene)
@@ -159,15 +161,9 @@ def _write_account(folder: Run, trainer: Trainer, device: str, timings: dict[str
 
 
 def _say_end(folder: Run, trainer: Trainer, data: Path, finished: bool) -> None:
-    clock = trainer.clock
-    if finished:
-        text = (
-            f"trained {clock.step} steps in {clock.elapsed:.0f} s to "
-            f"{len(trainer.model.splats)} splats: {folder.root}"
-        )
-    else:
-        text = (
-            f"interrupted at step {clock.step}; continue with: "
-            f"gsdmsr train --data {data} --out {folder.root} --resume"
-        )
-    Console(stderr=True).print(text, soft_wrap=True, highlight=False, markup=False)
+    steps, seconds, splats = trainer.clock.step, trainer.clock.elapsed, len(trainer.model.splats)
+    text = f"trained {steps} steps in {seconds:.0f} s to {splats} splats: {folder.root}"
+    if not finished:
+        again = ("gsdmsr", "train", "--data", str(data), "--out", str(folder.root), "--resume")
+        text = f"interrupted at step {steps}; continue with: {shlex.join(again)}"
+    Console(stderr=True).out(text, highlight=False)

@@ -31,11 +31,11 @@ def read_json(path: Path) -> dict[str, Any]:
         document = json.loads(path.read_bytes().decode("utf-8-sig"))
     except json.JSONDecodeError as error:
         where = f"line {error.lineno}, column {error.colno}"
-        raise DataError(f"{path}: malformed JSON at {where}: {error.msg}") from error
+        raise DataError(f"{path}: malformed JSON at {where}: {error.msg}; correct it") from error
     except OSError as error:
         raise DataError(f"{path} cannot be read: {error.strerror or error}") from error
     except (ValueError, RecursionError) as error:
-        raise DataError(f"{path}: malformed JSON: {error}") from error
+        raise DataError(f"{path}: malformed JSON: {error}; correct it") from error
     return mapping(document, str(path))
 
 
@@ -82,7 +82,7 @@ def rigid_pose(value: object, where: str) -> NDArray[np.float64]:
     rows = [sequence(row, where) for row in sequence(value, where)]
     if [len(row) for row in rows] != [4, 4, 4, 4]:
         raise DataError(f"{where} is not 4 x 4 numbers")
-    pose = np.array([[number(entry, f"an entry of {where}") for entry in row] for row in rows])
+    pose = np.array([[number(entry, f"{where}: an entry") for entry in row] for row in rows])
     if not np.allclose(pose[3], [0, 0, 0, 1], rtol=0, atol=1e-6):
         raise DataError(f"{where} is not a rigid pose: its last row is not 0 0 0 1")
     rotation = pose[:3, :3]
@@ -117,13 +117,16 @@ def picture_path(root: Path, text: object, where: str) -> Path:
         for extension in ("", *EXTENSIONS):
             path = root / (relative + extension)
             if not path.resolve().is_relative_to(inside):
-                raise DataError(f"{where} is {_shown(text)}, which leads out of {root}")
+                raise DataError(
+                    f"{where} is {_shown(text)}, which leads out of {root}; put the picture inside"
+                )
             if path.is_file():
                 return path
     except (OSError, ValueError, RuntimeError) as error:  # Too long, a null byte, a loop of links.
         raise DataError(f"{where} is {_shown(text)}, which is not a usable path") from error
     raise DataError(
-        f"{where}: image {root / relative} does not exist, nor with {', '.join(EXTENSIONS)}"
+        f"{where}: image {root / relative} does not exist, nor with "
+        f"{', '.join(EXTENSIONS)}; restore it or remove the frame"
     )
 
 

@@ -6,6 +6,7 @@ import ctypes
 import hashlib
 import os
 import sys
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -52,8 +53,23 @@ def _keep_large_blocks_in_the_heap() -> None:
         mallopt(m_trim_threshold, 2**31 - 1)
 
 
+def _load_tbb() -> None:
+    """Load the threading library that pip installed, which the system's loader does not find.
+
+    Numba prefers it where it is. Its threads spin briefly, yield and then sleep, which suits many
+    short kernels both on an idle machine and on a busy one; OpenMP's can only do one or the other.
+    """
+    try:
+        files = metadata.distribution("tbb").files or []
+        library = next(f.locate() for f in files if f.name in ("libtbb.so.12", "tbb12.dll"))
+        ctypes.CDLL(str(Path(str(library)).resolve()), mode=ctypes.RTLD_GLOBAL)
+    except (metadata.PackageNotFoundError, StopIteration, OSError):
+        return  # OpenMP serves, or Numba's own threads
+
+
 os.environ.setdefault("NUMBA_CACHE_DIR", str(_cache_folder()))
 _keep_large_blocks_in_the_heap()
+_load_tbb()
 
 import numba  # noqa: E402  (reads NUMBA_CACHE_DIR when imported)
 

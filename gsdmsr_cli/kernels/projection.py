@@ -76,8 +76,8 @@ def pixel_range(centre, half, size):
     """
     low = centre - half - float32(0.5) - _ROUNDING
     high = centre + half - float32(0.5) + _ROUNDING
-    first = int(math.ceil(min(max(low, float32(0)), float32(size))))
-    last = int(math.floor(min(max(high, float32(-1)), float32(size - 1))))
+    first = math.ceil(min(max(low, float32(0)), float32(size)))
+    last = math.floor(min(max(high, float32(-1)), float32(size - 1)))
     return first, last
 
 

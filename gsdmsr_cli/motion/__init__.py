@@ -1,8 +1,8 @@
 """One file per motion: how splats move over time.
 
 A motion is a module of this package with ``Options``, a frozen dataclass of its settings, and
-``start(options, facts, generator) -> Motion``, which begins as the identity. Motions never import
-one another; what they share lies in ``gsdmsr_cli.fields``.
+``start(options, facts, count, generator) -> Motion``, which begins as the identity. Motions never
+import one another; what they share lies in ``gsdmsr_cli.fields``.
 """
 
 from __future__ import annotations
@@ -50,16 +50,23 @@ class Motion(Protocol):
         """Return everything that is trained or saved, by name, in a fixed order."""
 
     def groups(self) -> dict[str, str]:
-        """Return, for every trained tensor, the learning rate it follows: planes or network."""
+        """Return, for every trained tensor, which of the preset's learning rates it follows.
+
+        "planes" or "network" where all splats share it; the name of a splat's tensor, such as
+        "means", where it has a row for each of them.
+        """
 
 
-def start_motion(settings: Mapping[str, Any], facts: Facts, generator: torch.Generator) -> Motion:
-    """Make the motion ``settings["name"]`` with the rest of the settings as its options.
+def start_motion(
+    settings: Mapping[str, Any], facts: Facts, count: int, generator: torch.Generator
+) -> Motion:
+    """Make the motion ``settings["name"]`` of ``count`` splats, with the other settings as options.
 
     Raises:
         UsageError: no motion has that name, or an option is unknown or out of range.
     """
     module = plugins.load(__name__, str(settings.get("name", "")))
     options = {key: value for key, value in settings.items() if key != "name"}
-    motion: Motion = module.start(strict.build(module.Options, options, "motion"), facts, generator)
+    built = strict.build(module.Options, options, "motion")
+    motion: Motion = module.start(built, facts, count, generator)
     return motion

@@ -78,6 +78,6 @@ class HexPlaneMotion:
         return {n: "planes" if n.startswith("grid") else "network" for n in self.tensors()}
 
 
-def start(options: Options, facts: Facts, generator: torch.Generator) -> HexPlaneMotion:
+def start(options: Options, facts: Facts, count: int, generator: torch.Generator) -> HexPlaneMotion:
     """Return a motion that is the identity until its network's last layer has learnt."""
     return HexPlaneMotion(options, facts, generator)

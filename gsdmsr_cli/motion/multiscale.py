@@ -7,7 +7,7 @@ rotations and scales through a network with a shared trunk, which also sees the 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -94,8 +94,8 @@ class MultiscaleMotion:
             fine = planes.lookup(self.fine, points, when)
             seen = torch.cat([features, fine], dim=1) if self.options.pyramid else fine
             deformation = network.apply_network(self.decoder, seen)
-            return displace(splats, deformation + _widened(offset))
-        return displace(splats, _widened(offset))
+            return displace(splats, deformation, offset)
+        return replace(splats, means=splats.means + offset)
 
     def take(self, rows: Tensor) -> None:
         """Hold nothing per splat."""
@@ -126,11 +126,8 @@ class MultiscaleMotion:
         return {n: "network" if "decoder" in n else "planes" for n in self.tensors()}
 
 
-def _widened(offset: Tensor) -> Tensor:
-    """Return an offset of the mean (N, 3) as a deformation (N, 10)."""
-    return torch.nn.functional.pad(offset, (0, OUTPUTS - offset.shape[1]))
-
-
-def start(options: Options, facts: Facts, generator: torch.Generator) -> MultiscaleMotion:
+def start(
+    options: Options, facts: Facts, count: int, generator: torch.Generator
+) -> MultiscaleMotion:
     """Return a motion that is the identity until its decoders' last layers have learnt."""
     return MultiscaleMotion(options, facts, generator)

@@ -39,10 +39,9 @@ def rasterize(
         camera, degree, *tensors
     )
     bins = binning.bin_splats(
-        *(array(t) for t in (means2d, conics, depths, opacities, tiles)),
-        camera.width,
-        camera.height,
-    )
+        array(means2d), array(conics), array(depths), array(opacities), array(tiles),
+        camera.width, camera.height,
+    )  # fmt: skip
     screen = means2d, conics, opacities
     size = camera.width, camera.height
     rgb, alpha = _Blend.apply(bins, size, *screen, colours, background)
@@ -101,7 +100,7 @@ class _Project(Function):
         *_: Any,
     ) -> tuple[Tensor | None, ...]:
         saved = ctx.saved_tensors
-        means, quats, log_scales, _, sh, conics, opacities, colours = map(array, saved)
+        means, quats, log_scales, _logits, sh, conics, opacities, colours = map(array, saved)
         gradients = [torch.empty_like(tensor) for tensor in saved[:5]]
         d_means, d_quats, d_log_scales, d_logit_opacities, d_sh = map(array, gradients)
         incoming = [

@@ -66,9 +66,13 @@ def sample_points(
         inside += hit
         colours += pixels[row, column] / 255 * hit[:, None]
     share = (inside / seen.clamp(min=1)).clamp(min=1e-3)
-    rows = torch.multinomial(share.pow(SHARPNESS), count, generator=generator)
+    rows = torch.multinomial(share.pow(SHARPNESS), count, replacement=True, generator=generator)
+    # a small thing holds fewer candidates than points, so the points spread around them
+    spacing = 2 * scene.bound / len(candidates) ** (1 / 3)
+    means = candidates[rows] + spacing * (torch.rand(count, 3, generator=generator) - 0.5)
+    means = means.clamp(-scene.bound, scene.bound)
     mean_colours = colours / inside.clamp(min=1)[:, None]
-    return Points(candidates[rows], torch.where(inside[rows, None] > 0, mean_colours[rows], 0.5))
+    return Points(means, torch.where(inside[rows, None] > 0, mean_colours[rows], 0.5))
 
 
 def _pixels_of(

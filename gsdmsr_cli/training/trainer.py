@@ -35,7 +35,7 @@ PATIENCE = 20
 
 BACKGROUNDS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
 
-_SPLAT_NAMES = [STORED_AS + n for n in ("means", "quats", "log_scales", "logit_opacities", "sh")]
+_PER_SPLAT = ("means", "quats", "log_scales", "logit_opacities", "sh")
 _FIRST, _SECOND, _SEEN = "adam.first.", "adam.second.", "density."
 
 
@@ -62,10 +62,9 @@ class Trainer:
         self.generator = torch.Generator().manual_seed(preset.training.seed)
         self.facts = facts_of(scene)
         self.background = torch.tensor(BACKGROUNDS[preset.data.background])
-        self.model = Model(
-            initial_splats(scene, preset.splats, pictures, self.background, self.generator),
-            start_motion(preset.motion, self.facts, self.generator),
-        )
+        splats = initial_splats(scene, preset.splats, pictures, self.background, self.generator)
+        motion = start_motion(preset.motion, self.facts, len(splats), self.generator)
+        self.model = Model(splats, motion)
         self.optimizer = Adam()
         self.statistics = DensityStatistics(len(self.model.splats))
         self.clock = new_clock(preset.training)
@@ -127,8 +126,8 @@ class Trainer:
         """Start the motion after the static phase, without the momentum of what did not move."""
         if not self._moving and progress >= self.preset.training.static_until:
             self._moving = True
-            for name in _SPLAT_NAMES:
-                self.optimizer.forget(name, second=False)
+            for name in _PER_SPLAT:
+                self.optimizer.forget(STORED_AS + name, second=False)
         self.model.motion.advance(progress)
 
     def _rates(self, progress: float) -> dict[str, float]:
@@ -136,15 +135,21 @@ class Trainer:
         options = self.preset.optimizer
         static = self.preset.training.static_until
         p = (progress - static) / (1 - static) if static < 1 else 0.0
-        rates = {
-            STORED_AS + name: log_linear(getattr(options, name), p)
-            for name in self.model.splats.tensors()
+        groups = {
+            group: log_linear(getattr(options, group), p)
+            for group in (*_PER_SPLAT, "planes", "network")
         }
-        rates[STORED_AS + "means"] *= self.radius
-        groups = {g: log_linear(getattr(options, g), p) for g in ("planes", "network")}
-        for name, group in self.model.motion.groups().items():
-            rates[MOVED_BY + name] = groups[group]
-        return rates
+        groups["means"] *= self.radius
+        rates = {STORED_AS + name: groups[name] for name in _PER_SPLAT}
+        moving = self.model.motion.groups()
+        return rates | {MOVED_BY + name: groups[group] for name, group in moving.items()}
+
+    def _per_splat(self) -> list[str]:
+        """Return the names of all tensors with one row per splat."""
+        moving = self.model.motion.groups()
+        return [STORED_AS + name for name in _PER_SPLAT] + [
+            MOVED_BY + name for name, group in moving.items() if group in _PER_SPLAT
+        ]
 
     def _control_density(self, progress: float) -> None:
         options, step = self.preset.density, self.clock.step
@@ -162,7 +167,7 @@ class Trainer:
             with torch.no_grad():
                 for name, tensor in self.model.splats.tensors().items():
                     tensor.copy_(getattr(grown, name))
-            self.optimizer.take(_SPLAT_NAMES, rows, fresh)
+            self.optimizer.take(self._per_splat(), rows, fresh)
             self.statistics = DensityStatistics(len(rows))
         if self._resets < len(options.reset_at) and progress >= options.reset_at[self._resets]:
             self._resets += 1

@@ -143,7 +143,7 @@ def test_a_misspelt_option_or_name_is_answered_with_the_nearest() -> None:
     with pytest.raises(UsageError, match=r"unknown motion 'hexplan'; did you mean 'hexplane'\?"):
         started("hexplan")
     with pytest.raises(UsageError, match="unknown motion ''"):
-        start_motion({}, FACTS, generator())
+        start_motion({}, FACTS, 1, generator())
 
 
 @every_grid
@@ -236,5 +236,5 @@ def test_multiscale_without_the_pyramid_gives_the_decoder_fewer_inputs() -> None
 @pytest.mark.parametrize(("frames", "nodes"), [(2, 8), (100, 25), (150, 38)])
 def test_the_time_grid_follows_from_the_frames(frames: int, nodes: int) -> None:
     facts = motions.Facts(bound=1.0, frames=frames)
-    motion = start_motion({"name": "hexplane"}, facts, generator())
+    motion = start_motion({"name": "hexplane"}, facts, 1, generator())
     assert motion.tensors()["grid.0.time"].shape[2] == nodes

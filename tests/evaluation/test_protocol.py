@@ -1,0 +1,177 @@
+"""How pictures are compared: closed forms, averages, and reasons for what is missing."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from datasets import noise, write_picture
+from torch import Tensor
+
+from gsdmsr_cli.camera import Camera
+from gsdmsr_cli.errors import DataError
+from gsdmsr_cli.evaluation import protocol
+from gsdmsr_cli.evaluation.lpips import NETS, Lpips, Missing
+from gsdmsr_cli.evaluation.protocol import Studio, average, load_nets, score, score_views, storage
+from gsdmsr_cli.model import Model
+from gsdmsr_cli.motion import Facts, start_motion
+from gsdmsr_cli.pictures import Pictures
+from gsdmsr_cli.raster import load_engine
+from gsdmsr_cli.scene import View
+from gsdmsr_cli.splats import Splats
+
+BACKGROUND = (0.2, 0.4, 0.6)
+
+
+def grey(level: float) -> Tensor:
+    return torch.full((12, 14, 3), level)
+
+
+def test_scores_of_the_true_picture_itself() -> None:
+    picture = torch.from_numpy(noise(12, 14, 3).astype(np.float32)) / 255
+    scores = score(picture, picture, {})
+    assert scores == {"psnr": 100.0, "psnr_float": 100.0, "ssim": pytest.approx(1.0)}
+
+
+def test_psnr_is_of_rounded_pictures_and_psnr_float_is_not() -> None:
+    """101.4 / 255 rounds to 101 / 255; the true picture is 100 / 255."""
+    scores = score(grey(101.4 / 255), grey(100 / 255), {})
+    assert scores["psnr"] == pytest.approx(20 * math.log10(255), abs=1e-3)
+    assert scores["psnr_float"] == pytest.approx(20 * math.log10(255 / 1.4), abs=1e-3)
+
+
+def test_drawn_values_outside_are_clamped() -> None:
+    assert score(grey(7.0), grey(1.0), {})["psnr_float"] == 100.0
+    assert score(grey(-3.0), grey(0.0), {})["psnr"] == 100.0
+
+
+def test_a_picture_with_nan_has_no_scores() -> None:
+    drawn = grey(0.5)
+    drawn[3, 4, 1] = math.nan
+    assert score(drawn, grey(0.5), {}) == {"psnr": None, "psnr_float": None, "ssim": None}
+
+
+def test_lpips_is_of_the_rounded_picture_and_none_where_missing() -> None:
+    seen = []
+
+    def net(drawn: Tensor, true: Tensor) -> float:
+        seen.append((drawn, true))
+        return 0.25
+
+    drawn, true = grey(101.4 / 255), grey(0.0)
+    nets = {"lpips_alex": net, "lpips_vgg": Missing("no weights", ())}
+    scores = score(drawn, true, nets)  # type: ignore[arg-type]
+    assert (scores["lpips_alex"], scores["lpips_vgg"]) == (0.25, None)
+    assert torch.equal(seen[0][0], grey(101 / 255)) and seen[0][1] is true
+
+
+def test_averages_are_means_over_frames_and_none_where_a_frame_has_none() -> None:
+    frames = [{"psnr": 20.0, "ssim": 0.5}, {"psnr": 31.0, "ssim": None}, {"psnr": 30.0, "ssim": 1}]
+    assert average(frames) == {"psnr": 27.0, "ssim": None}
+
+
+def test_every_missing_value_has_its_reason() -> None:
+    nets = {"lpips_alex": None, "lpips_vgg": Missing("no weights", ("a", "b")), "lpips_x": None}
+    aggregate = {"psnr": 20.0, "lpips_alex": 0.5, "lpips_vgg": None, "lpips_x": None}
+    found = protocol.with_reasons(aggregate, nets)  # type: ignore[arg-type]
+    assert found == {
+        "psnr": 20.0,
+        "lpips_alex": {"value": 0.5, "reason": None, "searched": []},
+        "lpips_vgg": {"value": None, "reason": "no weights", "searched": ["a", "b"]},
+        "lpips_x": {"value": None, "reason": "not a number in at least one frame", "searched": []},
+    }
+    json.dumps(found, allow_nan=False)
+
+
+def test_nets_without_weights_say_where_they_were_looked_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("GSDMSR_LPIPS_DIR", raising=False)
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path))
+    nets = load_nets((64, 64))
+    assert nets.keys() == {f"lpips_{net}" for net in NETS}
+    for net in nets.values():
+        assert isinstance(net, Missing) and net.reason and net.searched
+
+
+def test_pictures_too_small_for_a_net_are_a_reason(shared_data: Path) -> None:
+    folder = shared_data / "lpips"
+    large, small = (load_nets((side, 200), folder=folder) for side in (200, 8))
+    found = {name for name, net in large.items() if isinstance(net, Lpips)}
+    if not found:
+        pytest.skip(f"{folder} holds no LPIPS weights")
+    for name in found:
+        net = small[name]
+        assert isinstance(net, Missing) and "pictures of 8 x 200 px" in net.reason
+
+
+@pytest.fixture
+def studio() -> Studio:
+    """One grey splat that covers the picture, and its background."""
+    splats = Splats(
+        means=torch.zeros(1, 3),
+        quats=torch.tensor([[1.0, 0, 0, 0]]),
+        log_scales=torch.full((1, 3), math.log(50.0)),
+        logit_opacities=torch.zeros(1),
+        sh=torch.zeros(1, 1, 3),
+    )
+    motion = start_motion({"name": "static"}, Facts(1.0, 2), 1, torch.Generator())
+    pictures = Pictures(BACKGROUND, 2, 10**6)
+    engine, background = load_engine("reference"), torch.tensor(BACKGROUND)
+    return Studio(Model(splats, motion), engine, pictures, background)
+
+
+def view_of(path: Path, name: str) -> View:
+    pose = np.eye(4)
+    pose[2, 3] = 4.0
+    camera = Camera(pose, 20.0, 20.0, 10.0, 8.0, 20, 16)
+    return View(name, camera, 0.5, "test", path / f"{name}.png")
+
+
+def test_a_studio_draws_and_loads_at_the_size_of_its_pictures(
+    studio: Studio, tmp_path: Path
+) -> None:
+    write_picture(tmp_path / "a.png", np.full((16, 20, 3), 51, np.uint8))
+    view = view_of(tmp_path, "a")
+    drawn, true = studio.draw(view), studio.true(view)
+    assert drawn.shape == true.shape == (8, 10, 3)
+    assert not drawn.requires_grad
+    torch.testing.assert_close(true, torch.full((8, 10, 3), 0.2))
+    expected = 0.5 * 0.5 + 0.5 * torch.tensor(BACKGROUND)  # half opaque, half grey
+    torch.testing.assert_close(drawn, expected.expand(8, 10, 3), atol=5e-3, rtol=0)
+
+
+def test_views_are_scored_in_order_and_told(studio: Studio, tmp_path: Path) -> None:
+    views = [view_of(tmp_path, name) for name in "ab"]
+    for view, level in zip(views, (77, 200), strict=True):
+        write_picture(view.image_path, np.full((16, 20, 3), level, np.uint8))
+    told: list[int] = []
+    scored = score_views(studio, views, {}, told.append)
+    assert [view for view, _ in scored] == views and told == [1, 2]
+    for view, scores in scored:
+        assert scores == score(studio.draw(view), studio.true(view), {})
+    assert scored[0][1]["psnr"] != scored[1][1]["psnr"]
+
+
+def test_a_missing_picture_is_told(studio: Studio, tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=r"b\.png"):
+        score_views(studio, [view_of(tmp_path, "b")], {}, lambda done: None)
+
+
+def test_storage_counts_the_bytes_of_each_part() -> None:
+    tensors = {
+        "splats.means": torch.zeros(10, 3),
+        "splats.quats": torch.zeros(10, 4),
+        "motion.grid": torch.zeros(7, dtype=torch.float64),
+        "adam.first.splats.means": torch.zeros(10, 3),
+        "generator": torch.zeros(9, dtype=torch.uint8),
+    }
+    assert storage(tensors) == {
+        "splats_bytes": 280,
+        "motion_bytes": 56,
+        "training_state_bytes": 129,
+    }

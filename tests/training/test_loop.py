@@ -1,0 +1,259 @@
+"""The loop: what is told and logged, when checkpoints are saved, and how Ctrl-C ends it."""
+
+from __future__ import annotations
+
+import json
+import math
+import signal
+import threading
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from training_checks import (
+    STEPS,
+    assert_same_tensors,
+    copies,
+    preset_of,
+    run_of,
+    trainer_of,
+)
+
+from gsdmsr_cli.errors import DataError, GsdmsrError
+from gsdmsr_cli.evaluation.metrics import psnr, quantize
+from gsdmsr_cli.run import Checkpoint, Run
+from gsdmsr_cli.splatting import draw
+from gsdmsr_cli.training import loop
+from gsdmsr_cli.training.loop import Report, train, watched_view
+from gsdmsr_cli.training.trainer import Step, Trainer
+
+
+def log_of(run: Run) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in run.log_path.read_text().splitlines()]
+
+
+@pytest.fixture
+def trainer(tiny_scene: Path) -> Trainer:
+    return trainer_of(tiny_scene, preset_of(motion="static"))
+
+
+@pytest.fixture
+def run(trainer: Trainer, tmp_path: Path) -> Run:
+    return run_of(trainer, tmp_path / "run")
+
+
+@pytest.fixture
+def saves(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """The step of every checkpoint that is saved."""
+    steps: list[int] = []
+    save = Run.save
+
+    def counting(self: Run, checkpoint: Checkpoint) -> None:
+        steps.append(checkpoint.step)
+        save(self, checkpoint)
+
+    monkeypatch.setattr(Run, "save", counting)
+    return steps
+
+
+@pytest.fixture
+def interrupts() -> Any:
+    """Whoever gets Ctrl-C outside of the loop; put back afterwards."""
+    caught: list[int] = []
+    before = signal.signal(signal.SIGINT, lambda number, frame: caught.append(number))
+    yield caught
+    signal.signal(signal.SIGINT, before)
+
+
+def test_it_trains_to_the_end_and_saves_the_result(
+    trainer: Trainer, run: Run, saves: list[int]
+) -> None:
+    told: list[Report] = []
+    assert train(trainer, run, told.append) is True
+    assert trainer.clock.step == STEPS == told[-1].step and told[-1].progress == 1
+    assert saves == [STEPS]
+    checkpoint = run.load()
+    assert (checkpoint.step, checkpoint.progress) == (STEPS, 1.0)
+    assert 0 < checkpoint.elapsed <= trainer.clock.elapsed
+    model, _ = run.load_model()
+    assert_same_tensors(copies(model.tensors()), copies(trainer.model.tensors()))
+
+
+def test_every_report_is_told_and_logged(trainer: Trainer, run: Run) -> None:
+    told: list[Report] = []
+    losses: list[float] = []
+    step = trainer.step
+
+    def remember() -> Step:
+        made = step()
+        losses.append(made.loss)
+        return made
+
+    trainer.step = remember  # type: ignore[method-assign]
+    train(trainer, run, told.append)
+    log = log_of(run)
+    assert log == [report.entry() for report in told]
+    assert len(told) == STEPS  # each step is more than 2 % of this training
+    assert [entry["step"] for entry in log] == list(range(1, STEPS + 1))
+    assert [entry["loss"] for entry in log] == losses
+    assert all(a["elapsed"] <= b["elapsed"] for a, b in pairwise(log))
+    assert log[-1]["splats"] == len(trainer.model.splats)
+    assert all(entry["ms_per_step"] > 0 and entry["val_psnr"] > 0 for entry in log)
+
+
+def test_a_report_sums_up_the_steps_since_the_last(
+    trainer: Trainer, run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(loop, "TELL_EVERY_PROGRESS", 0.35)
+    losses = iter([1.0, 2.0, math.nan, 6.0] + [math.nan] * 10 + [5.0] * 12)
+
+    def step() -> Step:
+        trainer.clock.step += 1
+        return Step(next(losses))
+
+    trainer.step = step  # type: ignore[method-assign]
+    trainer.clock.steps = 26
+    train(trainer, run, lambda report: None)
+    log = log_of(run)
+    assert [entry["step"] for entry in log] == [10, 20, 26]
+    assert [entry["loss"] for entry in log] == [3.0, 5.0, 5.0]
+
+
+def test_without_a_finite_loss_the_report_has_none(trainer: Trainer, run: Run) -> None:
+    def step() -> Step:
+        trainer.clock.step += 1
+        return Step(math.nan)
+
+    trainer.step = step  # type: ignore[method-assign]
+    train(trainer, run, lambda report: None)
+    assert {entry["loss"] for entry in log_of(run)} == {None}
+
+
+def test_the_psnr_is_of_the_middle_view_of_val(trainer: Trainer, run: Run) -> None:
+    told: list[Report] = []
+    train(trainer, run, told.append)
+    view = trainer.scene.split("val")[1]
+    assert watched_view(trainer.scene) is view
+    with torch.no_grad():
+        camera = trainer.pictures.camera(view)
+        frame = draw(trainer.model, camera, view.time, trainer.engine, trainer.background)
+    true = trainer.pictures.load(view).permute(1, 2, 0) / 255
+    assert told[-1].psnr == pytest.approx(psnr(quantize(frame.rgb), true))
+    assert told[-1].psnr != told[0].psnr
+
+
+def test_without_val_a_train_view_is_watched(trainer: Trainer, run: Run) -> None:
+    views = tuple(view for view in trainer.scene.views if view.split != "val")
+    trainer.scene = replace(trainer.scene, views=views)
+    train(trainer, run, lambda report: None)
+    assert watched_view(trainer.scene) is trainer.scene.split("train")[6]
+    assert all("train_psnr" in entry and "val_psnr" not in entry for entry in log_of(run))
+
+
+def test_a_model_that_is_not_a_number_has_no_psnr(trainer: Trainer, run: Run) -> None:
+    def step() -> Step:
+        trainer.clock.step += 1
+        trainer.background = torch.full((3,), math.nan)
+        return Step(1.0)
+
+    trainer.step = step  # type: ignore[method-assign]
+    train(trainer, run, lambda report: None)
+    assert {entry["val_psnr"] for entry in log_of(run)} == {None}
+
+
+def test_checkpoints_are_saved_at_intervals(
+    tiny_scene: Path, tmp_path: Path, saves: list[int]
+) -> None:
+    preset = preset_of("training.checkpoint_minutes=1e-9", motion="static")
+    trainer = trainer_of(tiny_scene, preset)
+    train(trainer, run_of(trainer, tmp_path / "run"), lambda report: None)
+    assert saves == [*range(1, STEPS + 1), STEPS]
+
+
+def test_a_training_ends_with_its_budget(tiny_scene: Path, tmp_path: Path) -> None:
+    trainer = trainer_of(
+        tiny_scene, preset_of("training.budget=0.5s", "training.steps=10000", motion="static")
+    )
+    told: list[Report] = []
+    assert train(trainer, run_of(trainer, tmp_path / "run"), told.append)
+    assert trainer.clock.progress == 1 and 0.5 <= trainer.clock.elapsed < 30
+    assert 1 < told[-1].step <= trainer.clock.step < 10_000  # which is where steps would end it
+
+
+def test_ctrl_c_ends_after_the_step_and_saves(
+    trainer: Trainer, run: Run, saves: list[int], interrupts: list[int]
+) -> None:
+    def press(report: Report) -> None:
+        if report.step == 5:
+            signal.raise_signal(signal.SIGINT)
+
+    handler = signal.getsignal(signal.SIGINT)
+    assert train(trainer, run, press) is False
+    assert trainer.clock.step == 5 and saves == [5] and interrupts == []
+    assert run.load().step == 5
+    assert signal.getsignal(signal.SIGINT) is handler
+
+
+def test_ctrl_c_in_a_step_does_not_cut_it(
+    trainer: Trainer, run: Run, interrupts: list[int]
+) -> None:
+    step = trainer.step
+
+    def pressed() -> Step:
+        if trainer.clock.step == 2:
+            signal.raise_signal(signal.SIGINT)
+        return step()
+
+    trainer.step = pressed  # type: ignore[method-assign]
+    assert train(trainer, run, lambda report: None) is False
+    assert run.load().step == 3 and log_of(run)[-1]["step"] == 3 and interrupts == []
+
+
+def test_a_second_ctrl_c_goes_where_it_went_before(
+    trainer: Trainer, run: Run, interrupts: list[int]
+) -> None:
+    def press_twice(report: Report) -> None:
+        signal.raise_signal(signal.SIGINT)
+        signal.raise_signal(signal.SIGINT)
+
+    assert train(trainer, run, press_twice) is False
+    assert interrupts == [signal.SIGINT]
+
+
+def test_ctrl_c_is_left_alone_outside_of_the_main_thread(trainer: Trainer, run: Run) -> None:
+    ended: list[bool] = []
+    thread = threading.Thread(target=lambda: ended.append(train(trainer, run, lambda report: None)))
+    thread.start()
+    thread.join(60)
+    assert ended == [True]
+
+
+@pytest.mark.parametrize("error", [GsdmsrError("diverged"), DataError("a.png: truncated")])
+def test_an_error_leaves_the_last_checkpoint(
+    tiny_scene: Path, tmp_path: Path, interrupts: list[int], error: GsdmsrError
+) -> None:
+    preset = preset_of("training.checkpoint_minutes=1e-9", motion="static")
+    trainer = trainer_of(tiny_scene, preset)
+    run, step = run_of(trainer, tmp_path / "run"), trainer.step
+
+    def fails() -> Step:
+        if trainer.clock.step == 4:
+            raise error
+        return step()
+
+    trainer.step = fails  # type: ignore[method-assign]
+    handler = signal.getsignal(signal.SIGINT)
+    with pytest.raises(type(error)):
+        train(trainer, run, lambda report: None)
+    assert run.load().step == 4
+    assert signal.getsignal(signal.SIGINT) is handler
+
+
+def test_time_left_follows_from_the_pace() -> None:
+    report = Report(10, 30.0, 0.25, 0.1, 5, 3.0, 20.0, "val")
+    assert report.remaining == pytest.approx(90.0)
+    assert math.isfinite(replace(report, progress=0.0).remaining)
+    assert replace(report, progress=1.0).remaining == 0

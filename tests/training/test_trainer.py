@@ -1,0 +1,280 @@
+"""The trainer: that it learns, its phases, how it goes on after a stop, when it gives up."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from kernel_checks import assert_same_on_threads
+from torch import Tensor
+from training_checks import (
+    STEPS,
+    assert_same_tensors,
+    copies,
+    preset_of,
+    run_of,
+    trainer_of,
+)
+
+from gsdmsr_cli import motion as motions
+from gsdmsr_cli import plugins
+from gsdmsr_cli.errors import GsdmsrError
+from gsdmsr_cli.frame import Frame
+from gsdmsr_cli.raster import best_engine
+from gsdmsr_cli.splats import Splats
+from gsdmsr_cli.training import trainer as trainer_module
+from gsdmsr_cli.training.trainer import PATIENCE, Trainer
+
+every_motion = pytest.mark.parametrize("motion", plugins.names(motions.__name__))
+
+SPLATS = ("means", "quats", "log_scales", "logit_opacities", "sh")
+
+
+class Witness:
+    """An engine that remembers what it was asked to draw."""
+
+    def __init__(self) -> None:
+        self.splats: list[Splats] = []
+        self.sizes: list[tuple[int, int]] = []
+        self.degrees: list[int] = []
+
+    def unavailable(self, device: str) -> str | None:
+        return None
+
+    def rasterize(self, splats: Splats, camera: Any, background: Any, *rest: Any) -> Frame:
+        self.splats.append(splats.map(lambda t: t.detach().clone()))
+        self.sizes.append((camera.width, camera.height))
+        self.degrees.append(rest[0])
+        return best_engine("cpu").rasterize(splats, camera, background, *rest)
+
+
+def after(trainer: Trainer, steps: int) -> list[float]:
+    """Make steps and return their losses."""
+    return [trainer.step().loss for _ in range(steps)]
+
+
+def state_of(trainer: Trainer) -> dict[str, Tensor]:
+    return copies(trainer.checkpoint().tensors)
+
+
+@every_motion
+def test_training_lowers_the_loss(tiny_scene: Path, motion: str) -> None:
+    options = ["training.steps=80", "splats.count=300", "density.reset_at=[]", "density.cap=400"]
+    losses = after(trainer_of(tiny_scene, preset_of(*options, motion=motion)), 80)
+    assert sum(losses[-12:]) < 0.6 * sum(losses[:12])
+
+
+@pytest.fixture(scope="module")
+def uninterrupted(tiny_scene: Path) -> dict[str, tuple[list[float], dict[str, Tensor]]]:
+    """Losses and end of a whole training, by motion."""
+    found = {}
+    for motion in plugins.names(motions.__name__):
+        trainer = trainer_of(tiny_scene, preset_of(motion=motion))
+        found[motion] = after(trainer, STEPS), state_of(trainer)
+    return found
+
+
+# before anything has moved, while growing, right before and after the reset at 0.4, and while all
+# that still happens is pruning
+@every_motion
+@pytest.mark.parametrize("stop", [1, 7, 16, 17, 35])
+def test_a_resumed_training_goes_on_as_if_never_interrupted(
+    tiny_scene: Path, tmp_path: Path, uninterrupted: Any, motion: str, stop: int
+) -> None:
+    losses, end = uninterrupted[motion]
+    first = trainer_of(tiny_scene, preset_of(motion=motion))
+    assert after(first, stop) == losses[:stop]
+    run = run_of(first, tmp_path / "run")
+    run.save(first.checkpoint())
+    after(first, 3)  # what happens after a checkpoint does not count
+
+    second = trainer_of(tiny_scene, preset_of(motion=motion))
+    after(second, 2)  # nor what a trainer did before
+    second.restore(run.load())
+    assert second.clock.step == stop and second.clock.progress == stop / STEPS
+    assert after(second, STEPS - stop) == losses[stop:]
+    assert_same_tensors(state_of(second), end)
+
+
+def test_the_training_that_is_resumed_has_grown_and_moved(uninterrupted: Any) -> None:
+    """So that the test above compares something."""
+    for motion, (losses, end) in uninterrupted.items():
+        assert len(set(losses)) == STEPS
+        assert len(end["splats.means"]) == 200 == len(end["density.total"])
+        assert len(end["adam.second.splats.sh"]) == 200
+        assert (motion == "static") == (not any(name.startswith("motion.") for name in end))
+
+
+def test_wall_time_goes_on_too(tiny_scene: Path) -> None:
+    preset = preset_of("training.budget=100s")
+    first, second = trainer_of(tiny_scene, preset), trainer_of(tiny_scene, preset)
+    first.clock.before = 40.0
+    second.restore(first.checkpoint())
+    assert second.clock.elapsed == 40.0 and second.clock.progress == pytest.approx(0.4)
+
+
+def test_the_seed_decides(tiny_scene: Path, uninterrupted: Any) -> None:
+    other = trainer_of(tiny_scene, preset_of("training.seed=1"))
+    assert after(other, 3) != uninterrupted["multiscale"][0][:3]
+
+
+@every_motion
+def test_training_does_not_depend_on_the_number_of_threads(tiny_scene: Path, motion: str) -> None:
+    def train() -> Sequence[Tensor]:
+        trainer = trainer_of(tiny_scene, preset_of("losses.ssim=0.2", motion=motion))
+        after(trainer, STEPS)
+        return list(state_of(trainer).values())
+
+    assert_same_on_threads(train)
+
+
+@pytest.mark.parametrize("motion", ["hexplane", "multiscale"])
+def test_nothing_moves_in_the_static_phase(tiny_scene: Path, motion: str) -> None:
+    witness = Witness()
+    options = ["training.static_until=0.25", "density.start=999"]
+    trainer = trainer_of(tiny_scene, preset_of(*options, motion=motion), witness)
+    start = copies(trainer.model.tensors())
+    for _ in range(STEPS // 4):
+        still = trainer.model.splats.means.detach().clone()
+        trainer.step()
+        assert torch.equal(witness.splats[-1].means, still)
+    for name, tensor in trainer.model.tensors().items():
+        assert torch.equal(tensor, start[name]) == name.startswith("motion."), name
+    after(trainer, 4)
+    changed = [
+        name
+        for name, tensor in trainer.model.tensors().items()
+        if name.startswith("motion.") and not torch.equal(tensor, start[name])
+    ]
+    assert changed
+    moved = [trainer.model.at(time).means for time in (0.0, 0.5)]
+    assert not torch.equal(*moved)
+
+
+def test_the_motion_starts_without_the_momentum_of_the_static_phase(tiny_scene: Path) -> None:
+    options = ["training.static_until=0.25", "density.start=999"]
+    trainer = trainer_of(tiny_scene, preset_of(*options))
+    after(trainer, STEPS // 4)
+    assert trainer.optimizer.first["splats.means"].any()
+    forgotten: list[tuple[str, bool]] = []
+    forget = trainer.optimizer.forget
+
+    def remember(name: str, second: bool = True) -> None:
+        forgotten.append((name, second))
+        forget(name, second)
+
+    trainer.optimizer.forget = remember  # type: ignore[method-assign]
+    after(trainer, 3)
+    # the second moments, which say how large a step may be, stay
+    assert forgotten == [(f"splats.{name}", False) for name in SPLATS]
+
+
+def test_every_view_is_seen_before_any_again(tiny_scene: Path) -> None:
+    trainer, seen = trainer_of(tiny_scene, preset_of()), []
+    load = trainer.pictures.load
+
+    def remember(view: Any) -> Tensor:
+        seen.append(view.name)
+        return load(view)
+
+    trainer.pictures.load = remember  # type: ignore[method-assign]
+    after(trainer, 36)
+    rounds = [seen[i : i + 12] for i in (0, 12, 24)]
+    for names in rounds:
+        assert len(set(names)) == 12
+    assert rounds[0] != rounds[1]
+
+
+def test_several_views_a_step_are_averaged(tiny_scene: Path) -> None:
+    witness = Witness()
+    trainer = trainer_of(tiny_scene, preset_of("training.views_per_step=3"), witness)
+    after(trainer, 2)
+    assert len(witness.splats) == 6 and trainer.clock.step == 2
+    assert trainer.optimizer.steps["splats.means"] == 2
+
+
+def test_pictures_are_small_at_first_where_asked_for(tiny_scene: Path) -> None:
+    witness = Witness()
+    preset = preset_of("training.low_resolution_until=0.5", "data.downscale=2")
+    after(trainer_of(tiny_scene, preset, witness), STEPS)
+    assert witness.sizes == [(12, 12)] * (STEPS // 2) + [(24, 24)] * (STEPS // 2)
+
+
+def test_higher_degrees_of_colour_join_later(tiny_scene: Path) -> None:
+    witness = Witness()
+    preset = preset_of("splats.sh_degree=2", "splats.sh_start=0.25")
+    after(trainer_of(tiny_scene, preset, witness), STEPS)
+    assert witness.degrees == [0] * 10 + [1] * 10 + [2] * 20
+
+
+def test_splats_grow_up_to_the_cap_and_opacities_are_reset(tiny_scene: Path) -> None:
+    witness = Witness()
+    options = ["density.reset_at=[0.5]", "density.until=0.4", "density.prune_opacity=0"]
+    after(trainer_of(tiny_scene, preset_of(*options), witness), STEPS)
+    counts = [len(splats) for splats in witness.splats]
+    assert counts[:6] == [120] * 6 and counts[6] > 120  # drawn after six steps
+    assert max(counts) == counts[-1] == 200
+    opacity = [float(torch.sigmoid(splats.logit_opacities).max()) for splats in witness.splats]
+    lowest = STEPS // 2 + 1  # drawn after the step that began at 0.5
+    assert opacity[lowest - 1] > 0.1 and opacity[lowest] <= 0.01 + 1e-6
+    assert opacity.count(opacity[lowest]) == 1
+
+
+def test_a_training_without_splats_gives_up(tiny_scene: Path) -> None:
+    trainer = trainer_of(tiny_scene, preset_of("density.prune_opacity=0.999"))
+    with pytest.raises(GsdmsrError, match=r"no splats are left at step 6; lower density\.prune"):
+        after(trainer, STEPS)
+
+
+class Losses:
+    """Loss functions that are not finite when told so."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.factor = 1.0
+        self.true = trainer_module.photometric_loss
+        monkeypatch.setattr(trainer_module, "photometric_loss", self)
+
+    def __call__(self, *arguments: Any) -> Tensor:
+        return self.true(*arguments) * self.factor
+
+
+@pytest.fixture
+def losses(monkeypatch: pytest.MonkeyPatch) -> Losses:
+    return Losses(monkeypatch)
+
+
+@pytest.mark.parametrize("factor", [math.nan, math.inf])
+def test_a_step_without_a_finite_loss_changes_nothing(
+    tiny_scene: Path, losses: Losses, factor: float
+) -> None:
+    trainer = trainer_of(tiny_scene, preset_of())
+    after(trainer, 8)
+    before = state_of(trainer)
+    del before["generator"]
+    losses.factor = factor
+    assert math.isnan(trainer.step().loss)
+    assert trainer.clock.step == 9  # or a training of many such steps would have no end
+    found = state_of(trainer)
+    del found["generator"]
+    assert_same_tensors(found, before)
+    losses.factor = 1.0
+    assert all(map(math.isfinite, after(trainer, 3)))
+    assert all(tensor.isfinite().all() for tensor in trainer.model.tensors().values())
+
+
+def test_training_gives_up_after_many_losses_in_a_row_that_are_not_finite(
+    tiny_scene: Path, losses: Losses
+) -> None:
+    trainer = trainer_of(tiny_scene, preset_of("training.steps=1000", "density.start=999"))
+    losses.factor = math.nan
+    after(trainer, PATIENCE - 1)
+    losses.factor = 1.0
+    after(trainer, 1)  # patience begins anew
+    losses.factor = math.nan
+    after(trainer, PATIENCE - 1)
+    with pytest.raises(GsdmsrError, match=f"not finite for {PATIENCE} steps up to step 40"):
+        trainer.step()

@@ -1,0 +1,48 @@
+"""A short training on the tiny scene, for tests of the trainer, its loop and its run folder."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from gsdmsr_cli.formats import read_scene
+from gsdmsr_cli.pictures import Pictures
+from gsdmsr_cli.preset import Preset, load_preset
+from gsdmsr_cli.raster import Engine, best_engine
+from gsdmsr_cli.run import Run, create_run
+from gsdmsr_cli.training.trainer import Trainer
+
+STEPS = 40
+
+OPTIONS = (
+    f"training.steps={STEPS}", "training.static_until=0.1",
+    "splats.count=120", "splats.start=box", "splats.sh_start=0.5",
+    "density.start=6", "density.every=6", "density.until=0.8", "density.gradient=1e-7",
+    "density.cap=200", "density.reset_at=[0.4]",
+)  # fmt: skip
+"""Every phase of a training within 40 steps: static, coarse, fine; growing, a reset, pruning."""
+
+
+def preset_of(*options: str, motion: str = "multiscale") -> Preset:
+    return load_preset("dnerf", None, [*OPTIONS, f"motion={{name: {motion}}}", *options])
+
+
+def trainer_of(data: Path, preset: Preset, engine: Engine | None = None) -> Trainer:
+    pictures = Pictures((1.0, 1.0, 1.0), preset.data.downscale, 1 << 24)
+    return Trainer(read_scene(data), preset, engine or best_engine("cpu"), pictures)
+
+
+def run_of(trainer: Trainer, root: Path) -> Run:
+    return create_run(root, "dnerf", trainer.preset, trainer.facts, trainer.scene)
+
+
+def copies(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
+    return {name: tensor.detach().clone() for name, tensor in tensors.items()}
+
+
+def assert_same_tensors(found: dict[str, Tensor], expected: dict[str, Tensor]) -> None:
+    assert found.keys() == expected.keys()
+    for name, tensor in expected.items():
+        assert torch.equal(found[name], tensor), name
