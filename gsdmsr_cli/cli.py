@@ -75,26 +75,38 @@ def _common(
 def train(
     data: Annotated[Path, typer.Option(metavar="DIR", help="Scene folder, such as a D-NeRF one.")],
     out: Annotated[Path, typer.Option(metavar="RUN", help="Run folder to write.")],
-    preset: Annotated[str | None, typer.Option(help="Preset to start from.")] = None,
+    preset: Annotated[
+        str | None, typer.Option(metavar="NAME", help="Preset to start from.")
+    ] = None,
     config: Annotated[
         Path | None, typer.Option(metavar="F.yaml", help="File of options over the preset.")
     ] = None,
     set_: Annotated[
         list[str] | None, typer.Option("--set", metavar="a.b=v", help="One option; repeatable.")
     ] = None,
-    budget: Annotated[str | None, typer.Option(help="Wall time of training, such as 8m.")] = None,
-    steps: Annotated[int | None, typer.Option(help="Number of steps instead of a budget.")] = None,
-    downscale: Annotated[int | None, typer.Option(help="Divide both sides of pictures.")] = None,
+    budget: Annotated[
+        str | None, typer.Option(metavar="8m", help="Wall time of training: 90s, 8m, 1.5h.")
+    ] = None,
+    steps: Annotated[
+        int | None, typer.Option(metavar="N", help="Number of steps instead of a budget.")
+    ] = None,
+    downscale: Annotated[
+        int | None, typer.Option(metavar="N", help="Divide both sides of pictures by N.")
+    ] = None,
     background: Annotated[
         Background | None, typer.Option(help="Colour behind transparent pixels.")
     ] = None,
-    seed: Annotated[int | None, typer.Option(help="Seed of every random choice.")] = None,
+    seed: Annotated[int | None, typer.Option(metavar="N", help="Seed of random choices.")] = None,
     device: Annotated[
         Literal["auto", "cpu", "cuda"], typer.Option(help="Where to compute.")
     ] = "auto",
-    threads: Annotated[int | None, typer.Option(help="CPU threads; 0 takes all cores.")] = None,
-    resume: Annotated[bool, typer.Option("--resume", help="Continue RUN.")] = False,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace RUN.")] = False,
+    threads: Annotated[
+        int | None, typer.Option(metavar="N", help="CPU threads; 0 takes all cores.")
+    ] = None,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Go on from RUN's last checkpoint.")
+    ] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an earlier RUN.")] = False,
 ) -> None:
     """Reconstruct a moving scene from its pictures."""
     if budget is not None and steps is not None:
@@ -212,7 +224,7 @@ def kernels(
     ] = None,
     as_json: Json = False,
 ) -> None:
-    """Time every kernel, forward and backward."""
+    """Time drawing and a training step, forward and backward."""
     from gsdmsr_cli.commands import benchmark as command
 
     command.run(yardstick, as_json)

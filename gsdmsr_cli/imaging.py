@@ -117,8 +117,8 @@ def write_webm(path: Path, frames: Iterable[NDArray[np.uint8]], fps: float) -> N
         if _count_frames(temporary) != written:
             height, width, _ = first.shape
             raise DataError(
-                f"cannot write {path}: the video is incomplete; is the disk full, or are pictures "
-                f"of {width} x {height} px too small for VP8?"
+                f"cannot write {path}: the file is incomplete; is the disk full? "
+                f"Or are {width} x {height} px too few for VP8?"
             )
 
 

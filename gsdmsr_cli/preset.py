@@ -86,7 +86,7 @@ class SplatOptions:
         sh_start: progress at which degree 1 joins; higher degrees follow.
     """
 
-    count: int = 10000
+    count: int = 2500
     start: Literal["box", "silhouettes"] = "silhouettes"
     opacity: float = 0.1
     sh_degree: int = 1
@@ -116,9 +116,9 @@ class TrainingOptions:
 
     steps: int = 10000
     budget: str | None = None
-    static_until: float = 0.08
+    static_until: float = 0.04
     views_per_step: int = 1
-    low_resolution_until: float = 0.0
+    low_resolution_until: float = 0.4
     checkpoint_minutes: float = 2.0
     seed: int = 0
     threads: int = 0
@@ -161,13 +161,13 @@ class OptimizerOptions:
         network: of the motion's networks.
     """
 
-    means: tuple[float, float] = (7e-4, 7e-6)
-    log_scales: tuple[float, float] = (5e-3, 1e-3)
-    quats: tuple[float, float] = (1e-3, 2e-4)
+    means: tuple[float, float] = (7e-4, 3.5e-5)
+    log_scales: tuple[float, float] = (5e-3, 2e-3)
+    quats: tuple[float, float] = (1e-3, 5e-4)
     logit_opacities: tuple[float, float] = (0.05, 0.01)
-    sh: tuple[float, float] = (2.5e-3, 5e-4)
-    planes: tuple[float, float] = (8e-3, 1e-4)
-    network: tuple[float, float] = (8e-4, 2e-5)
+    sh: tuple[float, float] = (2.5e-3, 1e-3)
+    planes: tuple[float, float] = (8e-3, 5e-4)
+    network: tuple[float, float] = (8e-4, 1e-4)
 
     def __post_init__(self) -> None:
         for rate in fields(self):
@@ -193,7 +193,7 @@ class DensityOptions:
 
     every: int = 100
     start: int = 300
-    until: float = 0.55
+    until: float = 0.45
     gradient: float = 2e-4
     split_scale: float = 0.01
     prune_scale: float = 0.1

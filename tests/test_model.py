@@ -18,7 +18,7 @@ every_motion = pytest.mark.parametrize("name", plugins.names(motions.__name__))
 
 
 def model_of(name: str) -> Model:
-    return Model(splats_of(COUNT), disturbed(started(name)))
+    return Model(splats_of(COUNT), disturbed(started(name, COUNT)))
 
 
 def saved(model: Model) -> dict[str, Tensor]:

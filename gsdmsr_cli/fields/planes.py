@@ -122,24 +122,20 @@ class _Lookup(Function):
         points, *tensors = ctx.saved_tensors
         d_features = d_features.contiguous()
         wanted = ctx.needs_input_grad[0]
-        d_points = torch.zeros_like(points) if wanted else None
+        spaces, d_spaces = tensors[::2], [torch.empty_like(space) for space in tensors[::2]]
+        d_lines = tuple(np.empty_like(line) for line in ctx.lines)
+        share = torch.empty((d_features.shape[1] // LANES, len(points), 3) if wanted else (0, 0, 0))
+        places = [(i, chunk) for i, space in enumerate(spaces) for chunk in range(space.shape[1])]
+        kernels.lookup_backward(
+            array(points), np.array(places), tuple(map(array, spaces)), tuple(ctx.lines), array(d_features),
+            tuple(map(array, d_spaces)), d_lines, array(share),
+        )  # fmt: skip
         gradients: list[Tensor] = []
-        offset = 0
-        for space, time, line in zip(tensors[::2], tensors[1::2], ctx.lines, strict=True):
-            chunks = space.shape[1]
-            d_space, d_time = torch.empty_like(space), torch.empty_like(time)
-            d_line = np.empty_like(line)
-            share = torch.empty((chunks, len(points), 3) if wanted else (0, 0, 0))
-            kernels.lookup_backward(
-                array(points), array(space), line, array(d_features), offset,
-                array(d_space), d_line, array(share),
-            )  # fmt: skip
+        for d_space, d_line, time in zip(d_spaces, d_lines, tensors[1::2], strict=True):
+            d_time = torch.empty_like(time)
             kernels.spread_time(d_line, ctx.time, array(d_time))
-            if d_points is not None:
-                d_points += share.sum(0)
             gradients += [d_space, d_time]
-            offset += chunks * LANES
-        return d_points, None, *gradients
+        return share.sum(0) if wanted else None, None, *gradients
 
 
 def penalty(

@@ -135,25 +135,30 @@ def _scatter_bilinear(flat, at, row, wx, wy, d):
 
 
 @parallel
-def lookup_backward(points, space, lines, d_features, offset, d_space, d_lines, d_points):
-    """Write ``d_space`` and ``d_lines``; write the points' share of every chunk to ``d_points``.
+def lookup_backward(points, places, spaces, lines, d_features, d_spaces, d_lines, d_points):
+    """Write ``d_spaces`` and ``d_lines``; write the points' share of every chunk to ``d_points``.
 
     Every thread owns whole chunks of 16 channels, so that threads never write to one place and
     the sums do not depend on their number. Points outside [-1, 1] get no gradient along that axis.
 
     Args:
-        d_points: (chunks, N, 3) out, to be summed over chunks, or (0, 0, 0) if not wanted.
+        places: (C / 16, 2) level and chunk of every 16 columns of the features.
+        spaces, lines, d_spaces, d_lines: one array per level.
+        d_features: (N, C) of all levels side by side.
+        d_points: (C / 16, N, 3) out, to be summed over chunks, or (0, 0, 0) if not wanted.
     """
-    n, size, chunks = points.shape[0], space.shape[2], space.shape[1]
-    planes, strips, d_out = space.reshape(-1), lines.reshape(-1), d_features.reshape(-1)
-    d_planes, d_strips = d_space.reshape(-1), d_lines.reshape(-1)
-    width = d_features.shape[1]
-    row, plane, strip = size * _LANES, size * size * _LANES, size * _LANES
-    cells = _HALF * float32(size - 1)
-    for c in prange(chunks):
+    n, width, d_out = points.shape[0], d_features.shape[1], d_features.reshape(-1)
+    for task in prange(width // _LANES):
+        level, c = places[task, 0], places[task, 1]
+        space, d_space, d_line = spaces[level], d_spaces[level], d_lines[level]
+        chunks, size = space.shape[1], space.shape[2]
+        planes, strips = space.reshape(-1), lines[level].reshape(-1)
+        d_planes, d_strips = d_space.reshape(-1), d_line.reshape(-1)
+        row, plane, strip = size * _LANES, size * size * _LANES, size * _LANES
+        cells = _HALF * float32(size - 1)
         for axis in range(3):
             d_space[axis, c] = float32(0)
-            d_lines[axis, c] = float32(0)
+            d_line[axis, c] = float32(0)
         for i in range(n):
             ix, wx = cell(points[i, 0], size)
             iy, wy = cell(points[i, 1], size)
@@ -172,7 +177,7 @@ def lookup_backward(points, space, lines, d_features, offset, d_space, d_lines, 
                 _linear(strips, y, wy),
                 _linear(strips, z, wz),
             )
-            d = simd.load(d_out, i * width + offset + c * _LANES)
+            d = simd.load(d_out, i * width + task * _LANES)
             d_time = d * (s_x * s_y * s_z)
             d_xy, d_xz, d_yz = d_time * s_xz * s_yz, d_time * s_xy * s_yz, d_time * s_xy * s_xz
             d = d * (s_xy * s_xz * s_yz)
@@ -184,9 +189,9 @@ def lookup_backward(points, space, lines, d_features, offset, d_space, d_lines, 
                 gx = gx + hx + d_x * (simd.load(strips, x + _LANES) - simd.load(strips, x))
                 gy = gy + hy + d_y * (simd.load(strips, y + _LANES) - simd.load(strips, y))
                 gz = gz + hz + d_z * (simd.load(strips, z + _LANES) - simd.load(strips, z))
-                d_points[c, i, 0] = _inside(points[i, 0]) * cells * simd.reduce_sum(gx)
-                d_points[c, i, 1] = _inside(points[i, 1]) * cells * simd.reduce_sum(gy)
-                d_points[c, i, 2] = _inside(points[i, 2]) * cells * simd.reduce_sum(gz)
+                d_points[task, i, 0] = _inside(points[i, 0]) * cells * simd.reduce_sum(gx)
+                d_points[task, i, 1] = _inside(points[i, 1]) * cells * simd.reduce_sum(gy)
+                d_points[task, i, 2] = _inside(points[i, 2]) * cells * simd.reduce_sum(gz)
             _scatter_bilinear(d_planes, xy, row, wx, wy, d_xy)
             _scatter_bilinear(d_planes, xz, row, wx, wz, d_xz)
             _scatter_bilinear(d_planes, yz, row, wy, wz, d_yz)

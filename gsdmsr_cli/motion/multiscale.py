@@ -40,11 +40,11 @@ class Options:
     coarse_level: int = 32
     coarse_channels: int = 16
     coarse_time_ratio: float = 0.125
-    coarse_until: float = 0.1
-    levels: tuple[int, ...] = (64, 128)
-    channels: int = 32
-    time_ratio: float = 0.25
-    width: int = 64
+    coarse_until: float = 0.06
+    levels: tuple[int, ...] = (32, 64)
+    channels: int = 16
+    time_ratio: float = 0.2
+    width: int = 32
     pyramid: bool = True
     detach: bool = False
     offset_weight: float = 1e-3

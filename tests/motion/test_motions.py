@@ -40,7 +40,7 @@ def assert_equal(found: Splats, expected: Splats, **tolerance: float) -> None:
 @cache
 def learnt(name: str) -> Motion:
     """Return a motion that moves; to be copied by whoever resizes it."""
-    return disturbed(started(name))
+    return disturbed(started(name, COUNT))
 
 
 def weighted_sum(splats: Splats) -> Tensor:
@@ -59,7 +59,7 @@ def test_the_known_motions_are_found() -> None:
 def test_starts_as_the_identity(name: str) -> None:
     splats = splats_of(COUNT)
     for progress in (0.0, 1.0):
-        motion = started(name)
+        motion = started(name, COUNT)
         motion.advance(progress)
         for time in TIMES:
             assert_equal(motion.at(splats, time), splats)
@@ -69,7 +69,7 @@ def test_starts_as_the_identity(name: str) -> None:
 def test_moves_once_it_has_learnt(name: str) -> None:
     """So that the other tests compare something; only ``static`` has nothing to learn."""
     splats = splats_of(COUNT)
-    motion = disturbed(started(name))
+    motion = disturbed(started(name, COUNT))
     at_times = [motion.at(splats, time) for time in TIMES]
     assert all(t.isfinite().all() for moved in at_times for t in moved.tensors().values())
     assert (name == "static") == all(torch.equal(m.means, splats.means) for m in at_times)
@@ -91,7 +91,7 @@ def test_resize_then_move_is_move_then_resize(name: str, rows: list[int], time: 
 @every_motion
 def test_gradients_reach_everything_that_is_trained(name: str) -> None:
     splats = splats_of(50).map(torch.nn.Parameter)
-    motion = disturbed(started(name))
+    motion = disturbed(started(name, 50))
     tensors = motion.tensors()
     loss = torch.stack([weighted_sum(motion.at(splats, time)) for time in TIMES]).sum()
     loss.backward()
@@ -103,7 +103,7 @@ def test_gradients_reach_everything_that_is_trained(name: str) -> None:
 
 @every_motion
 def test_groups_name_trained_tensors_and_learning_rates(name: str) -> None:
-    motion = started(name)
+    motion = started(name, COUNT)
     rates = {field.name for field in fields(OptimizerOptions)}
     assert motion.groups().keys() <= motion.tensors().keys()
     assert set(motion.groups().values()) <= rates
@@ -111,7 +111,7 @@ def test_groups_name_trained_tensors_and_learning_rates(name: str) -> None:
 
 @every_motion
 def test_penalty_is_a_finite_scalar_that_can_be_learnt_from(name: str) -> None:
-    motion = disturbed(started(name))
+    motion = disturbed(started(name, COUNT))
     motion.at(splats_of(COUNT), 0.4)
     penalty = motion.penalty()
     if penalty is None:
@@ -123,9 +123,9 @@ def test_penalty_is_a_finite_scalar_that_can_be_learnt_from(name: str) -> None:
 
 @every_motion
 def test_tensors_keep_their_names_and_order(name: str) -> None:
-    motion = started(name)
+    motion = started(name, COUNT)
     before = list(motion.tensors())
-    assert list(disturbed(started(name)).tensors()) == before
+    assert list(disturbed(started(name, COUNT)).tensors()) == before
     motion.at(splats_of(COUNT), 0.5)
     motion.take(torch.tensor([0, 2]))
     assert list(motion.tensors()) == before

@@ -1,0 +1,249 @@
+"""What a user can get wrong ends in one line and an exit code, and spoils nothing."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from datasets import noise, write_picture
+
+from gsdmsr_cli import cli, files, imaging
+from gsdmsr_cli import run as runs
+from gsdmsr_cli.commands import train as train_command
+from gsdmsr_cli.errors import DataError, UsageError
+from gsdmsr_cli.formats import read_scene
+from gsdmsr_cli.pictures import Pictures
+from gsdmsr_cli.preset import load_preset
+from gsdmsr_cli.raster import best_engine
+from gsdmsr_cli.run import Run, continue_run, create_run, open_run, refuse_used
+from gsdmsr_cli.training.trainer import Trainer
+
+Gsdmsr = Callable[..., int]
+
+FEW = ("splats.count=20", "splats.start=box", "motion={name: static}")
+
+
+@pytest.fixture
+def gsdmsr(monkeypatch: pytest.MonkeyPatch) -> Gsdmsr:
+    def call(*arguments: object) -> int:
+        monkeypatch.setattr(sys, "argv", ["gsdmsr", *map(str, arguments)])
+        with pytest.raises(SystemExit) as ended:
+            cli.main()
+        assert isinstance(ended.value.code, int)
+        return ended.value.code
+
+    monkeypatch.delenv("GSDMSR_DEBUG", raising=False)
+    return call
+
+
+@pytest.fixture
+def run(tiny_scene: Path, tmp_path: Path) -> Run:
+    """A run that has made no step."""
+    scene, preset = read_scene(tiny_scene), load_preset("dnerf", None, FEW)
+    trainer = Trainer(scene, preset, best_engine("cpu"), Pictures((1.0, 1.0, 1.0), 1, 1 << 28))
+    made = create_run(tmp_path / "a [b] [/x] :smile:", "dnerf", preset, trainer.facts, scene)
+    made.save(trainer.checkpoint())
+    return made
+
+
+def one_line(capsys: pytest.CaptureFixture[str]) -> str:
+    out, err = capsys.readouterr()
+    assert out == "" and err.startswith("error: ") and err.count("\n") == 1
+    return err
+
+
+USAGE = {
+    "unknown preset": ("--preset dnref", "did you mean 'dnerf'?"),
+    "unknown key": ("--set training.stepz=3", "training.stepz.*did you mean 'steps'?"),
+    "unknown motion": ("--set motion.name=multiscal", "did you mean 'multiscale'?"),
+    "unknown option of a motion": ("--set motion.widht=3", "did you mean 'width'?"),
+    "no value": ("--set training.steps", "a.b=value"),
+    "no mapping": ("--set training=3 --steps 4", "training is 3; allowed: a mapping"),
+    "bad budget": ("--budget 8x", "allowed: null or a positive duration"),
+    "no steps": ("--steps 0", "steps is 0; allowed: 1 or more"),
+    "downscale of nothing": ("--downscale 0", "downscale is 0; allowed: 1 or more"),
+    "downscale beyond the picture": ("--downscale 49", "48 x 48 px.*allowed: 1 to 48"),
+}
+
+
+@pytest.mark.parametrize(("options", "message"), USAGE.values(), ids=USAGE)
+def test_options_that_do_not_exist_are_refused(
+    gsdmsr: Gsdmsr, tiny_scene: Path, tmp_path: Path, capsys: Any, options: str, message: str
+) -> None:
+    out = tmp_path / "run"
+    assert gsdmsr("train", "--data", tiny_scene, "--out", out, *options.split()) == 2
+    assert re.search(message, one_line(capsys))
+    assert not out.exists()
+
+
+def test_a_scalar_in_a_file_is_not_lost_under_an_override(tmp_path: Path) -> None:
+    config = tmp_path / "mine.yaml"
+    config.write_text("losses: 1\ntraining: 3\n")
+    with pytest.raises(UsageError, match=r"mine\.yaml:2: training is 3; allowed: a mapping"):
+        load_preset(None, config, ["training.steps=4"])
+
+
+@pytest.mark.parametrize("content", ['{"speed": 3}', "[]", "{"])
+def test_overwrite_spares_a_folder_whose_run_json_is_of_another_program(
+    gsdmsr: Gsdmsr, tiny_scene: Path, tmp_path: Path, capsys: Any, content: str
+) -> None:
+    (tmp_path / "run.json").write_text(content)
+    (tmp_path / "thesis.tex").touch()
+    assert gsdmsr("train", "--data", tiny_scene, "--out", tmp_path, "--overwrite") == 3
+    assert "exists and is not a run folder" in one_line(capsys)
+    assert (tmp_path / "thesis.tex").is_file() and (tmp_path / "run.json").is_file()
+
+
+def test_a_place_below_a_file_is_refused_at_once(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(DataError, match=r"run: cannot be made, since .*file is a file"):
+        refuse_used(tmp_path / "file" / "a" / "run", overwrite=True)
+
+
+def test_overwriting_keeps_the_folder_itself(run: Run, tiny_scene: Path) -> None:
+    """It may be a mounted disk, which cannot be removed, or somebody's link."""
+    (run.root / "eval").mkdir()
+    (run.root / "eval" / "metrics.json").touch()
+    (run.root / "link").symlink_to(tiny_scene, target_is_directory=True)
+    before = run.root.stat().st_ino
+    create_run(run.root, "again", run.preset, run.facts, read_scene(tiny_scene), overwrite=True)
+    assert [path.name for path in run.root.iterdir()] == ["run.json"]
+    assert run.root.stat().st_ino == before and (tiny_scene / "train").is_dir()
+
+
+def test_a_full_disk_is_told_before_the_training_not_after_it(
+    gsdmsr: Gsdmsr, tiny_scene: Path, tmp_path: Path, capsys: Any, monkeypatch: Any
+) -> None:
+    def full(*_: object, **__: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(runs, "save_file", full)
+    monkeypatch.setattr(train_command, "train", lambda *_: pytest.fail("it trains"))
+    options = [part for option in FEW for part in ("--set", option)]
+    assert gsdmsr("train", "--data", tiny_scene, "--out", tmp_path / "run", *options) == 3
+    assert "checkpoint.safetensors: cannot be written" in one_line(capsys)
+
+
+def test_a_document_that_cannot_be_written_leaves_nothing(tmp_path: Path) -> None:
+    (tmp_path / "a.json").mkdir()
+    with pytest.raises(DataError, match=r"a\.json: cannot be written"):
+        files.write_json(tmp_path / "a.json", {"x": 1})
+    assert [path.name for path in tmp_path.iterdir()] == ["a.json"]
+
+
+def test_what_a_killed_training_was_writing_is_cleared_away(run: Run, tiny_scene: Path) -> None:
+    for name in (".tmpAbc123", "checkpoint.part", "run.json.part"):
+        (run.root / name).touch()
+    continue_run(run, run.preset, read_scene(tiny_scene))
+    assert {path.name for path in run.root.iterdir()} == {"run.json", "checkpoint.safetensors"}
+
+
+@pytest.mark.parametrize(
+    "motion", [{"name": "nope"}, {"name": "hexplane"}, {"name": "static", "a": 1}]
+)
+@pytest.mark.parametrize("command", ["eval", "render", "export"])
+def test_a_description_that_does_not_fit_the_checkpoint_is_bad_data(
+    gsdmsr: Gsdmsr, run: Run, capsys: Any, motion: dict[str, Any], command: str
+) -> None:
+    path = run.root / "run.json"
+    document = json.loads(path.read_text())
+    document["preset"]["motion"] = motion
+    path.write_text(json.dumps(document))
+    more = ["--format", "ply", "--out", run.root / "x.ply"] if command == "export" else []
+    assert gsdmsr(command, run.root, *more) == 3
+    assert f"{run.root}: its model cannot be loaded" in one_line(capsys)
+
+
+def test_a_damaged_description_is_named_once(run: Run) -> None:
+    path = run.root / "run.json"
+    document = json.loads(path.read_text())
+    document["preset"]["training"]["stepz"] = 1
+    path.write_text(json.dumps(document))
+    with pytest.raises(DataError, match=r"preset: unknown key 'training\.stepz'") as caught:
+        open_run(run.root)
+    assert str(caught.value).count("run.json") == 1
+
+
+def test_names_of_folders_are_printed_as_they_are(gsdmsr: Gsdmsr, run: Run, capsys: Any) -> None:
+    target = run.root / "x.ply"
+    assert gsdmsr("export", run.root, "--format", "ply", "--out", target) == 0
+    assert capsys.readouterr().out == f"wrote {target}: 20 splats\n"
+    assert gsdmsr("render", run.root, "--path", "orbit", "--frames", 1) == 0
+    assert f"wrote {run.root / 'render' / 'orbit'}.webm and 1 pictures" in capsys.readouterr().out
+    assert gsdmsr("eval", run.root, "--split", "val") == 0
+    assert f"written to {run.root / 'eval' / 'metrics.json'}\n" in capsys.readouterr().out
+
+
+def test_eval_of_data_that_has_changed_is_refused(
+    gsdmsr: Gsdmsr, run: Run, tiny_scene: Path, tmp_path: Path, capsys: Any
+) -> None:
+    there = tmp_path / "there"
+    shutil.copytree(tiny_scene, there)
+    path = there / "transforms_train.json"
+    document = json.loads(path.read_text())
+    document["frames"].pop()
+    path.write_text(json.dumps(document))
+    assert gsdmsr("eval", run.root, "--data", there) == 3
+    assert "is not the data that" in one_line(capsys)
+    assert gsdmsr("eval", run.root, "--downscale", 49) == 2
+    assert "allowed: 1 to 48" in one_line(capsys)
+    assert not (run.root / "eval").exists()
+
+
+@pytest.mark.parametrize("part", ["below a file", "a file"])
+def test_the_demo_says_where_it_cannot_be(
+    gsdmsr: Gsdmsr, tmp_path: Path, capsys: Any, part: str
+) -> None:
+    (tmp_path / "file").touch()
+    below = part == "below a file"
+    out = tmp_path / "file" / "x" if below else tmp_path / "file"
+    assert gsdmsr("demo", "--out", out) == (3 if below else 2)
+    assert str(out) in one_line(capsys)
+
+
+def test_a_png_with_a_wrong_bit_is_refused_without_a_word_from_libpng(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "a.png"
+    write_picture(path, noise(40, 40))
+    whole = path.read_bytes()
+    assert imaging.read_image(path).shape == (40, 40, 4)
+    for place in np.linspace(50, len(whole) - 40, 9).astype(int):
+        broken = bytearray(whole)
+        broken[place] ^= 0xFF
+        path.write_bytes(bytes(broken))
+        with pytest.raises(DataError, match=r"a\.png is damaged .*checksum"):
+            imaging.read_image(path)
+    assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize(
+    ("statement", "code", "output"),
+    [("import slow", 130, ""), ("os.kill(os.getpid(), signal.SIGINT)", 0, "in order\n")],
+)
+def test_ctrl_c_ends_an_import_at_once_and_everything_else_in_order(
+    tmp_path: Path, statement: str, code: int, output: str
+) -> None:
+    """An exception in the middle of importing torch would abort the process with a core dump."""
+    (tmp_path / "slow.py").write_text(
+        "import os, signal\ntry:\n os.kill(os.getpid(), signal.SIGINT)\nfinally:\n print('no')"
+    )
+    program = (
+        "import os, signal\nfrom gsdmsr_cli import cli\n"
+        f"with cli._ctrl_c_that_spares_imports():\n  try:\n    {statement}\n"
+        "  except KeyboardInterrupt:\n    print('in order')\n"
+        "assert signal.getsignal(signal.SIGINT) is signal.default_int_handler"
+    )
+    call = [sys.executable, "-c", program]
+    done = subprocess.run(
+        call, cwd=tmp_path, capture_output=True, text=True, timeout=60, check=False
+    )
+    assert (done.returncode, done.stdout + done.stderr) == (code, output)
