@@ -161,7 +161,7 @@ class OptimizerOptions:
         network: of the motion's networks.
     """
 
-    means: tuple[float, float] = (7e-4, 3.5e-5)
+    means: tuple[float, float] = (2.5e-4, 5e-6)
     log_scales: tuple[float, float] = (5e-3, 2e-3)
     quats: tuple[float, float] = (1e-3, 5e-4)
     logit_opacities: tuple[float, float] = (0.05, 0.01)
@@ -194,7 +194,7 @@ class DensityOptions:
     every: int = 100
     start: int = 300
     until: float = 0.45
-    gradient: float = 2e-4
+    gradient: float = 3e-4
     split_scale: float = 0.01
     prune_scale: float = 0.1
     prune_opacity: float = 0.005

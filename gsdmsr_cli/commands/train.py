@@ -19,6 +19,7 @@ from gsdmsr_cli.errors import UsageError
 from gsdmsr_cli.files import write_json
 from gsdmsr_cli.formats import read_scene
 from gsdmsr_cli.kernels.jit import set_threads
+from gsdmsr_cli.motion import motion_options
 from gsdmsr_cli.pictures import Pictures
 from gsdmsr_cli.preset import Preset, load_preset
 from gsdmsr_cli.run import SCHEMA, Checkpoint, Run, continue_run, create_run, open_run, refuse_used
@@ -55,6 +56,7 @@ def run(
     earlier = open_run(out) if resume else None
     if earlier is None:
         options = load_preset(preset, config, overrides)
+        motion_options(options.motion)  # told now rather than after the data has been read
         refuse_used(out, overwrite)
     else:
         options = _resumed_options(earlier, preset, config, overrides)

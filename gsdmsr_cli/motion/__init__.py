@@ -57,16 +57,26 @@ class Motion(Protocol):
         """
 
 
+def motion_options(settings: Mapping[str, Any]) -> Any:
+    """Return the ``Options`` that ``settings`` ask for, of the motion ``settings["name"]``.
+
+    Raises:
+        UsageError: no motion has that name, or an option is unknown or out of range.
+    """
+    module = plugins.load(__name__, str(settings.get("name", "")))
+    located = settings if isinstance(settings, strict.Located) else strict.Located(settings)
+    return strict.build(module.Options, located.without("name"), "motion")
+
+
 def start_motion(
     settings: Mapping[str, Any], facts: Facts, count: int, generator: torch.Generator
 ) -> Motion:
     """Make the motion ``settings["name"]`` of ``count`` splats, with the other settings as options.
 
     Raises:
-        UsageError: no motion has that name, or an option is unknown or out of range.
+        UsageError: see ``motion_options``.
     """
-    module = plugins.load(__name__, str(settings.get("name", "")))
-    options = {key: value for key, value in settings.items() if key != "name"}
-    built = strict.build(module.Options, options, "motion")
-    motion: Motion = module.start(built, facts, count, generator)
+    options = motion_options(settings)
+    module = plugins.load(__name__, str(settings["name"]))
+    motion: Motion = module.start(options, facts, count, generator)
     return motion

@@ -64,7 +64,10 @@ USAGE = {
     "unknown preset": ("--preset dnref", "did you mean 'dnerf'?"),
     "unknown key": ("--set training.stepz=3", "training.stepz.*did you mean 'steps'?"),
     "unknown motion": ("--set motion.name=multiscal", "did you mean 'multiscale'?"),
-    "unknown option of a motion": ("--set motion.widht=3", "did you mean 'width'?"),
+    "unknown option of a motion": (
+        "--set motion.widht=3",
+        r"--set motion\.widht=3.*did you mean 'width'\?",
+    ),
     "no value": ("--set training.steps", "a.b=value"),
     "no mapping": ("--set training=3 --steps 4", "training is 3; allowed: a mapping"),
     "bad budget": ("--budget 8x", "allowed: null or a positive duration"),
