@@ -127,8 +127,8 @@ class _Lookup(Function):
         share = torch.empty((d_features.shape[1] // LANES, len(points), 3) if wanted else (0, 0, 0))
         places = [(i, chunk) for i, space in enumerate(spaces) for chunk in range(space.shape[1])]
         kernels.lookup_backward(
-            array(points), np.array(places), tuple(map(array, spaces)), tuple(ctx.lines), array(d_features),
-            tuple(map(array, d_spaces)), d_lines, array(share),
+            array(points), np.array(places), tuple(map(array, spaces)), tuple(ctx.lines),
+            array(d_features), tuple(map(array, d_spaces)), d_lines, array(share),
         )  # fmt: skip
         gradients: list[Tensor] = []
         for d_space, d_line, time in zip(d_spaces, d_lines, tensors[1::2], strict=True):
