@@ -94,7 +94,7 @@ def _sample_level(level: Level, points: Tensor, when: Tensor) -> Tensor:
     for line, axis in zip(lines, range(3), strict=True):
         x, w = lower[:, axis], upper_weight[:, axis, None]
         feature = feature * torch.lerp(line[:, x], line[:, x + 1], w)
-    return feature.transpose(0, 1).reshape(len(points), -1)
+    return feature.transpose(0, 1).reshape(len(points), level.channels)
 
 
 class _Lookup(Function):

@@ -184,7 +184,7 @@ def sqrt(_typing: Any, x: Any) -> Any:
 
 @intrinsic
 def exp2(_typing: Any, x: Any) -> Any:
-    """Return 2^x for -126 <= x <= 127, to a relative 2e-7.
+    """Return 2^x for -126 <= x <= 127, to a relative 4e-6.
 
     Rounds to the nearest integer, evaluates a degree-5 polynomial on the fraction in [-1/2, 1/2]
     and adds the integer to the exponent's bits. The rounding is an intrinsic of LLVM because the

@@ -56,6 +56,7 @@ def _spacing(means: Tensor, bound: float) -> Tensor:
     if count < 1:
         return torch.full((len(means),), 0.1 * bound)
     squares = []
+    means = means - means.mean(dim=0)  # cdist multiplies, which cancels far from the origin
     for chunk in means.split(1024):
         nearest = torch.cdist(chunk, means).topk(count + 1, largest=False).values[:, 1:]
         squares.append(nearest.square().mean(dim=1))

@@ -174,7 +174,8 @@ def test_the_motion_starts_without_the_momentum_of_the_static_phase(tiny_scene: 
 
 
 def test_every_view_is_seen_before_any_again(tiny_scene: Path) -> None:
-    trainer, seen = trainer_of(tiny_scene, preset_of()), []
+    preset = preset_of("training.low_resolution_until=0")
+    trainer, seen = trainer_of(tiny_scene, preset), []
     load = trainer.pictures.load
 
     def remember(view: Any) -> Tensor:
