@@ -194,7 +194,7 @@ class DensityOptions:
     every: int = 100
     start: int = 300
     until: float = 0.45
-    gradient: float = 3e-4
+    gradient: float = 5e-4
     split_scale: float = 0.01
     prune_scale: float = 0.1
     prune_opacity: float = 0.005
