@@ -91,8 +91,8 @@ def _prepare(scene: Scene, options: Preset, device: str) -> tuple[Trainer, dict[
     pictures = Pictures(
         BACKGROUNDS[options.data.background], options.data.downscale, options.data.cache_mib << 20
     )
-    trainer, start_s = _timed(lambda: Trainer(scene, options, engine, pictures))
     _, load_s = _timed(lambda: _preload(pictures, scene))
+    trainer, start_s = _timed(lambda: Trainer(scene, options, engine, pictures))
     compile_s = warm_up(scene, options, engine)
     return trainer, {"load_s": load_s + start_s, "compile_s": compile_s}
 
