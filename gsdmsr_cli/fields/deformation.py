@@ -9,14 +9,17 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor
 from torch.autograd import Function
+from torch.autograd.function import once_differentiable
 
 from gsdmsr_cli.fields.network import Layer
 from gsdmsr_cli.fields.planes import Level
+from gsdmsr_cli.kernels import deformation as kernels
 from gsdmsr_cli.splats import Splats
+from gsdmsr_cli.tensors import array, has_kernels
 
 Part = TypeVar("Part", Level, Layer)
 
-OUTPUTS = 10
+OUTPUTS = kernels.MEAN + kernels.QUAT + kernels.SCALE
 """Columns of a deformation: offsets of the mean (3), the quaternion (4) and the log scales (3)."""
 
 
@@ -28,15 +31,26 @@ def displace(splats: Splats, deformation: Tensor, shift: Tensor | None = None) -
         deformation: (N, 10), see ``OUTPUTS``.
         shift: (N, 3) a further offset of the means.
     """
-    means, quats, log_scales = _Displace.apply(
-        splats.means, splats.quats, splats.log_scales, deformation, shift
+    further = deformation.new_empty(0, 3) if shift is None else shift
+    stored = splats.means, splats.quats, splats.log_scales
+    if has_kernels(*stored, deformation, further):
+        means, quats, log_scales = _Displace.apply(*stored, deformation, further)
+        return replace(splats, means=means, quats=quats, log_scales=log_scales)
+    return displace_twin(splats, deformation, shift)
+
+
+def displace_twin(splats: Splats, deformation: Tensor, shift: Tensor | None = None) -> Splats:
+    """Return what ``displace`` does, in plain torch, for any device and dtype."""
+    offset, turn, growth = deformation.split([kernels.MEAN, kernels.QUAT, kernels.SCALE], dim=1)
+    return replace(
+        splats,
+        means=splats.means + offset + (0 if shift is None else shift),
+        quats=splats.quats + turn,
+        log_scales=splats.log_scales + growth,
     )
-    return replace(splats, means=means, quats=quats, log_scales=log_scales)
 
 
 class _Displace(Function):
-    """Three sums. Written out because their gradient is one copy, and autograd would make ten."""
-
     @staticmethod
     def forward(
         ctx: Any,
@@ -44,20 +58,23 @@ class _Displace(Function):
         quats: Tensor,
         log_scales: Tensor,
         deformation: Tensor,
-        shift: Tensor | None,
+        shift: Tensor,
     ) -> tuple[Tensor, Tensor, Tensor]:
-        moved = means + deformation[:, :3]
-        if shift is not None:
-            moved += shift
-        ctx.shifts = shift is not None
-        return moved, quats + deformation[:, 3:7], log_scales + deformation[:, 7:]
+        stored = [t.contiguous() for t in (means, quats, log_scales)]
+        moved = tuple(torch.empty_like(tensor) for tensor in stored)
+        given = [array(t) for t in (*stored, deformation, shift)]
+        kernels.displace(*given, *map(array, moved))
+        ctx.shifted = len(shift) > 0
+        return moved
 
     @staticmethod
-    def backward(
-        ctx: Any, d_means: Tensor, d_quats: Tensor, d_log_scales: Tensor
-    ) -> tuple[Tensor | None, ...]:
-        d_deformation = torch.cat([d_means, d_quats, d_log_scales], dim=1)
-        return d_means, d_quats, d_log_scales, d_deformation, d_means if ctx.shifts else None
+    @once_differentiable  # type: ignore[untyped-decorator]
+    def backward(ctx: Any, *given: Tensor) -> tuple[Tensor | None, ...]:
+        d_means, d_quats, d_log_scales = (d.contiguous() for d in given)
+        d_deformation = torch.empty(len(d_means), OUTPUTS)
+        incoming = [array(d) for d in (d_means, d_quats, d_log_scales)]
+        kernels.displace_backward(*incoming, array(d_deformation))
+        return d_means, d_quats, d_log_scales, d_deformation, d_means if ctx.shifted else None
 
 
 def time_nodes(frames: int, cells_per_frame: float, least: int = 8) -> int:

@@ -54,23 +54,25 @@ def new_level(resolution: int, times: int, channels: int, generator: torch.Gener
     return Level(space * 0.4 + 0.1, torch.ones(3, chunks, times, resolution, LANES))
 
 
-def lookup(levels: Sequence[Level], points: Tensor, time: float) -> Tensor:
-    """Return the features (N, sum of channels) of points (N, 3) in [-1, 1]^3 at time in [-1, 1].
+def lookup(levels: Sequence[Level], points: Tensor, time: float, bound: float = 1.0) -> Tensor:
+    """Return the features (N, sum of channels) of points (N, 3) in [-bound, bound]^3.
 
-    Each level gives the product of six samples; levels are concatenated. Coordinates outside
-    [-1, 1] are clamped to the border and pass no gradient.
+    Each level gives the product of six samples; levels are concatenated. The time is in [-1, 1].
+    Coordinates outside are clamped to the border and pass no gradient.
     """
     tensors = [tensor for level in levels for tensor in level]
     if has_kernels(points, *tensors):
-        features: Tensor = _Lookup.apply(points.contiguous(), time, *tensors)
+        features: Tensor = _Lookup.apply(points.contiguous(), time, bound, *tensors)
         return features
-    return lookup_twin(levels, points, time)
+    return lookup_twin(levels, points, time, bound)
 
 
-def lookup_twin(levels: Sequence[Level], points: Tensor, time: float) -> Tensor:
+def lookup_twin(
+    levels: Sequence[Level], points: Tensor, time: float, bound: float = 1.0
+) -> Tensor:
     """Return what ``lookup`` does, in plain torch, for any device and dtype."""
-    when = points.new_tensor(time)
-    return torch.cat([_sample_level(level, points, when) for level in levels], dim=1)
+    places, when = points * (1 / bound), points.new_tensor(time)
+    return torch.cat([_sample_level(level, places, when) for level in levels], dim=1)
 
 
 def _cell(x: Tensor, size: int) -> tuple[Tensor, Tensor]:
@@ -101,18 +103,13 @@ class _Lookup(Function):
     """All levels at one time, written side by side into one array of features."""
 
     @staticmethod
-    def forward(ctx: Any, points: Tensor, time: float, *tensors: Tensor) -> Tensor:
-        levels = [Level(*pair) for pair in zip(tensors[::2], tensors[1::2], strict=True)]
-        features = torch.empty(len(points), sum(level.channels for level in levels))
-        lines, offset = [], 0
-        for level in levels:
-            _, chunks, _, size, _ = level.time.shape
-            line = np.empty((3, chunks, size, LANES), np.float32)
-            kernels.collapse_time(array(level.time), time, line)
-            kernels.lookup(array(points), array(level.space), line, array(features), offset)
-            lines.append(line)
-            offset += level.channels
-        ctx.time, ctx.lines = time, lines
+    def forward(ctx: Any, points: Tensor, time: float, bound: float, *tensors: Tensor) -> Tensor:
+        spaces, times = (tuple(map(array, part)) for part in (tensors[::2], tensors[1::2]))
+        lines = tuple(np.empty(plane.shape[:2] + plane.shape[3:], np.float32) for plane in times)
+        features = torch.empty(len(points), sum(plane.shape[1] * LANES for plane in spaces))
+        where = array(points), np.float32(1 / bound), time
+        kernels.lookup(*where, spaces, times, lines, array(features))
+        ctx.where, ctx.spaces, ctx.lines = where, spaces, lines
         ctx.save_for_backward(points, *tensors)
         return features
 
@@ -120,22 +117,16 @@ class _Lookup(Function):
     @once_differentiable  # type: ignore[untyped-decorator]
     def backward(ctx: Any, d_features: Tensor) -> tuple[Tensor | None, ...]:
         points, *tensors = ctx.saved_tensors
-        d_features = d_features.contiguous()
         wanted = ctx.needs_input_grad[0]
-        spaces, d_spaces = tensors[::2], [torch.empty_like(space) for space in tensors[::2]]
-        d_lines = tuple(np.empty_like(line) for line in ctx.lines)
-        share = torch.empty((d_features.shape[1] // LANES, len(points), 3) if wanted else (0, 0, 0))
-        places = [(i, chunk) for i, space in enumerate(spaces) for chunk in range(space.shape[1])]
+        d_points = torch.empty_like(points) if wanted else torch.empty(0, 3)
+        gradients = [torch.empty_like(tensor) for tensor in tensors]
+        shares = np.empty((d_features.shape[1] // LANES, len(d_points), 3), np.float32)
         kernels.lookup_backward(
-            array(points), np.array(places), tuple(map(array, spaces)), tuple(ctx.lines),
-            array(d_features), tuple(map(array, d_spaces)), d_lines, array(share),
+            *ctx.where, ctx.spaces, ctx.lines, array(d_features.contiguous()),
+            tuple(map(array, gradients[::2])), tuple(map(array, gradients[1::2])),
+            tuple(map(np.empty_like, ctx.lines)), shares, array(d_points),
         )  # fmt: skip
-        gradients: list[Tensor] = []
-        for d_space, d_line, time in zip(d_spaces, d_lines, tensors[1::2], strict=True):
-            d_time = torch.empty_like(time)
-            kernels.spread_time(d_line, ctx.time, array(d_time))
-            gradients += [d_space, d_time]
-        return share.sum(0) if wanted else None, None, *gradients
+        return d_points if wanted else None, None, None, *gradients
 
 
 def penalty(

@@ -62,7 +62,7 @@ def _unfinished_rows(block, first, last):
 
 
 @parallel
-def blend(records, entries, starts, busiest, lanes, columns, background, rgb, transmittance, ends):
+def blend(records, entries, starts, busiest, lanes, columns, background, rgb, alpha, ends):
     """Draw every tile.
 
     Args:
@@ -72,12 +72,12 @@ def blend(records, entries, starts, busiest, lanes, columns, background, rgb, tr
         columns: tiles in a row.
         background: (3,) float32.
         rgb: (3, H', W') float32 out, H' and W' rounded up to whole tiles.
-        transmittance: (H', W') float32 out, what the splats let through.
+        alpha: (H', W') float32 out, what the splats cover.
         ends: (tiles,) int32 out, the entry after the last one blended.
     """
     stride = rgb.shape[2]
     plane = rgb.shape[1] * stride
-    pixels, through = rgb.reshape(-1), transmittance.reshape(-1)
+    pixels, cover = rgb.reshape(-1), alpha.reshape(-1)
     for lane in prange(lanes):
         block = np.empty(4 * _BLOCK, np.float32)
         one, zero = simd.splat(float32(1)), simd.splat(float32(0))
@@ -124,7 +124,7 @@ def blend(records, entries, starts, busiest, lanes, columns, background, rgb, tr
             for y in range(TILE):
                 o = (tile_y * TILE + y) * stride + tile_x * TILE
                 left = simd.load(block, y * TILE)
-                simd.store(through, o, left)
+                simd.store(cover, o, one - left)
                 for channel in range(3):
                     shade = simd.load(block, (1 + channel) * _BLOCK + y * TILE)
                     simd.store(pixels, channel * plane + o, shade + left * background[channel])
@@ -132,7 +132,7 @@ def blend(records, entries, starts, busiest, lanes, columns, background, rgb, tr
 
 @parallel
 def blend_backward(
-    records, entries, starts, busiest, ends, columns, rgb, transmittance, d_rgb, d_alpha, sums
+    records, entries, starts, busiest, ends, columns, rgb, alpha, d_rgb, d_alpha, sums
 ):
     """Sum every splat's share of the gradients over the pixels of each part of the picture.
 
@@ -140,14 +140,15 @@ def blend_backward(
     e dy^2 and of weight times d_rgb. Saturated pixels have e = 0.
 
     Args:
-        d_rgb: (3, H', W') float32. d_alpha: (H', W') float32. Both 0 outside the picture.
+        d_rgb: (3, H', W') float32, 0 outside the picture.
+        d_alpha: (H', W') float32, 0 outside the picture, or (0, 0) if it is 0 everywhere.
         sums: (PARTS, N, 16) float32 out, of which nine columns are used.
         others: see ``blend``.
     """
     stride = rgb.shape[2]
     plane = rgb.shape[1] * stride
-    pixels, through = rgb.reshape(-1), transmittance.reshape(-1)
-    d_pixels, d_cover = d_rgb.reshape(-1), d_alpha.reshape(-1)
+    pixels, cover = rgb.reshape(-1), alpha.reshape(-1)
+    d_pixels, d_cover, covered = d_rgb.reshape(-1), d_alpha.reshape(-1), d_alpha.shape[0] > 0
     for part in prange(PARTS):
         own = sums[part].reshape(-1)
         own[:] = float32(0)
@@ -168,8 +169,9 @@ def blend_backward(
                     d_red * simd.load(pixels, o)
                     + d_green * simd.load(pixels, o + plane)
                     + d_blue * simd.load(pixels, o + 2 * plane)
-                    - simd.load(d_cover, o) * simd.load(through, o)
                 )
+                if covered:
+                    left = left - simd.load(d_cover, o) * (one - simd.load(cover, o))
                 simd.store(block, y * TILE, one)
                 simd.store(block, _BLOCK + y * TILE, left)
                 simd.store(block, 2 * _BLOCK + y * TILE, d_red)

@@ -1,8 +1,9 @@
 """Small networks: all layers of a few rows at a time, so that what passes between stays in cache.
 
-Weights are (in, out), one layer after the other in one flat array, every width a multiple of 16.
-ReLU follows every layer but the last. The work is cut into a fixed number of blocks of rows, so
-that sums over rows do not depend on the number of threads.
+Weights are (in, out), one array per layer, every width but the last a multiple of 16; the kernels
+pack them into one array in which the last is as well. ReLU follows every layer but the last. The
+work is cut into a fixed number of blocks of rows, so that sums over rows do not depend on the number
+of threads.
 """
 
 from __future__ import annotations
@@ -13,8 +14,7 @@ from numba import float32, prange
 from gsdmsr_cli.kernels import simd
 from gsdmsr_cli.kernels.jit import inline, parallel, serial
 
-BLOCKS = 32
-"""Blocks of rows; the weights' gradient comes in as many parts."""
+_BLOCKS = 32
 
 _CHUNK = 64
 _LANES = simd.LANES
@@ -62,21 +62,45 @@ def _mask(values, outputs, at, count):
         simd.store(values, o, kept)
 
 
+@inline
+def _packed(weights, biases, turned):
+    """Return widths, weights and biases, each flat; the weights as (out, in) if ``turned``."""
+    layers = len(weights)
+    widths = np.empty(layers + 1, np.int64)
+    widths[0] = weights[0].shape[0]
+    size, columns = 0, 0
+    for layer in range(layers):
+        widths[layer + 1] = (weights[layer].shape[1] + _LANES - 1) // _LANES * _LANES
+        size += widths[layer] * widths[layer + 1]
+        columns += widths[layer + 1]
+    flat, offsets = np.zeros(size, np.float32), np.zeros(columns, np.float32)
+    at, column = 0, 0
+    for layer in range(layers):
+        k, o, weight = widths[layer], widths[layer + 1], weights[layer]
+        for j in range(weight.shape[1]):
+            offsets[column + j] = biases[layer][j]
+            for i in range(k):
+                flat[at + (j * k + i if turned else i * o + j)] = weight[i, j]
+        at, column = at + k * o, column + o
+    return widths, flat, offsets
+
+
 @parallel
-def forward(x, widths, weights, biases, outputs):
+def forward(x, weights, biases, outputs):
     """Write the outputs of all layers.
 
     Args:
-        x: (N, widths[0]) inputs.
-        widths: (L + 1,) of the inputs and of every layer's output.
-        weights, biases: of all layers, flat.
-        outputs: out, of all layers, flat: (N, widths[1]), then (N, widths[2]) and so on.
+        x: (N, inputs or more), of which the first columns are read.
+        weights, biases: one array per layer.
+        outputs: out, of all layers, flat: (N, outputs of the first), then of the second and so on,
+            the last rounded up to a multiple of 16.
     """
-    n, layers, x_flat = x.shape[0], widths.shape[0] - 1, x.reshape(-1)
-    for block in prange(BLOCKS):
+    n, layers, x_flat, x_row = x.shape[0], len(weights), x.reshape(-1), x.shape[1]
+    widths, w_flat, b_flat = _packed(weights, biases, False)
+    for block in prange(_BLOCKS):
         zero = simd.splat(float32(0))
-        last = n * (block + 1) // BLOCKS
-        for start in range(n * block // BLOCKS, last, _CHUNK):
+        last = n * (block + 1) // _BLOCKS
+        for start in range(n * block // _BLOCKS, last, _CHUNK):
             rows = min(_CHUNK, last - start)
             w_at, b_at, x_at, y_at = 0, 0, 0, 0
             for layer in range(layers):
@@ -84,11 +108,13 @@ def forward(x, widths, weights, biases, outputs):
                 here = y_at + start * o
                 for at in range(here, here + rows * o, o):
                     for j in range(0, o, _LANES):
-                        simd.store(outputs, at + j, simd.load(biases, b_at + j))
+                        simd.store(outputs, at + j, simd.load(b_flat, b_at + j))
                 source = x_flat if layer == 0 else outputs
+                pitch = x_row if layer == 0 else k
                 _add_product(
-                    source, x_at + start * k, k, 1, rows, weights, w_at, o, k, outputs, here, o, o
-                )
+                    source, x_at + start * pitch, pitch, 1, rows, w_flat, w_at, o, k,
+                    outputs, here, o, o,
+                )  # fmt: skip
                 if layer < layers - 1:
                     for at in range(here, here + rows * o, _LANES):
                         simd.store(outputs, at, simd.maximum(simd.load(outputs, at), zero))
@@ -97,43 +123,44 @@ def forward(x, widths, weights, biases, outputs):
 
 
 @parallel
-def backward(x, widths, turned, outputs, d_y, d_weights, d_biases, d_x):
+def backward(x, weights, biases, outputs, d_y, d_weights, d_biases, d_x):
     """Write the gradients of weights, biases and inputs.
 
     Args:
-        x, widths, outputs: see ``forward``.
-        turned: the weights, flat, every layer's as (out, in).
-        d_y: (N, widths[L]) gradient of the last layer's output.
-        d_weights, d_biases: (BLOCKS, ...) out, flat like the weights, in parts to be summed.
-        d_x: (N, widths[0]) out, or (0, 0) if not wanted.
+        x, weights, biases, outputs: see ``forward``.
+        d_y: (N, outputs) gradient of the last layer's output.
+        d_weights, d_biases: out, one array per layer.
+        d_x: like x, out, 0 in the columns that are not read; or (0, 0) if not wanted.
     """
-    n, layers, x_flat = x.shape[0], widths.shape[0] - 1, x.reshape(-1)
-    y_flat, w_flat, b_flat = d_y.reshape(-1), d_weights.reshape(-1), d_biases.reshape(-1)
+    n, layers, x_flat, x_row = x.shape[0], len(weights), x.reshape(-1), x.shape[1]
+    widths, turned, offsets = _packed(weights, biases, True)
     d_x_flat, wanted, widest = d_x.reshape(-1), d_x.shape[0] > 0, widths.max()
-    total = 0
-    for layer in range(layers):
-        total += n * widths[layer + 1]
-    for block in prange(BLOCKS):
-        d_weights[block] = float32(0)
-        d_biases[block] = float32(0)
+    size, columns, total = turned.shape[0], offsets.shape[0], outputs.shape[0]
+    w_sums = np.zeros((_BLOCKS, size), np.float32)
+    b_sums = np.zeros((_BLOCKS, columns), np.float32)
+    w_flat, b_flat = w_sums.reshape(-1), b_sums.reshape(-1)
+    for block in prange(_BLOCKS):
         after = np.empty(_CHUNK * widest, np.float32)
         before = np.empty(_CHUNK * widest, np.float32)
-        last = n * (block + 1) // BLOCKS
-        for start in range(n * block // BLOCKS, last, _CHUNK):
+        last = n * (block + 1) // _BLOCKS
+        for start in range(n * block // _BLOCKS, last, _CHUNK):
             rows = min(_CHUNK, last - start)
-            w_at, b_at, y_at = d_weights.shape[1], d_biases.shape[1], total
+            w_at, b_at, y_at = size, columns, total
             o = widths[layers]
-            for at in range(0, rows * o, _LANES):
-                simd.store(after, at, simd.load(y_flat, start * o + at))
+            after[: rows * o] = float32(0)
+            for r in range(rows):
+                for j in range(d_y.shape[1]):
+                    after[r * o + j] = d_y[start + r, j]
             for layer in range(layers - 1, -1, -1):
                 k, o = widths[layer], widths[layer + 1]
                 w_at, b_at, y_at = w_at - k * o, b_at - o, y_at - n * o
                 x_at = 0 if layer == 0 else y_at - n * k
                 source = x_flat if layer == 0 else outputs
-                _add_rows(after, rows, o, b_flat, block * d_biases.shape[1] + b_at)
+                pitch = x_row if layer == 0 else k
+                _add_rows(after, rows, o, b_flat, block * columns + b_at)
                 _add_product(
-                    source, x_at + start * k, 1, k, k, after, 0, o, rows,
-                    w_flat, block * d_weights.shape[1] + w_at, o, o,
+                    source, x_at + start * pitch, 1, pitch, k, after, 0, o, rows,
+                    w_flat, block * size + w_at, o, o,
                 )  # fmt: skip
                 if layer > 0:
                     before[: rows * k] = float32(0)
@@ -141,7 +168,21 @@ def backward(x, widths, turned, outputs, d_y, d_weights, d_biases, d_x):
                     _mask(before, outputs, x_at + start * k, rows * k)
                     after, before = before, after
                 elif wanted:
-                    d_x_flat[start * k : (start + rows) * k] = float32(0)
+                    d_x_flat[start * x_row : (start + rows) * x_row] = float32(0)
                     _add_product(
-                        after, 0, o, 1, rows, turned, w_at, k, o, d_x_flat, start * k, k, k
+                        after, 0, o, 1, rows, turned, w_at, k, o, d_x_flat, start * x_row, x_row, k
                     )
+    for block in range(1, _BLOCKS):
+        for o in range(0, size, _LANES):
+            simd.store(w_flat, o, simd.load(w_flat, o) + simd.load(w_flat, block * size + o))
+        for o in range(0, columns, _LANES):
+            simd.store(b_flat, o, simd.load(b_flat, o) + simd.load(b_flat, block * columns + o))
+    w_at, b_at = 0, 0
+    for layer in range(layers):
+        k, o = widths[layer], widths[layer + 1]
+        for j in range(d_biases[layer].shape[0]):
+            d_biases[layer][j] = b_flat[b_at + j]
+        for i in range(k):
+            for j in range(d_weights[layer].shape[1]):
+                d_weights[layer][i, j] = w_flat[w_at + i * o + j]
+        w_at, b_at = w_at + k * o, b_at + o

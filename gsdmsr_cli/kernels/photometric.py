@@ -43,16 +43,25 @@ def to_float(target, planes):
 
 @parallel
 def l1(drawn, target, height, width, weight, gradient, sums):
-    """Add weight * sign(drawn - target) to ``gradient``; sums (3 * H',) gets |differences|."""
-    for task in prange(3 * drawn.shape[1]):
-        channel, y = task // drawn.shape[1], task % drawn.shape[1]
+    """Write weight * sign(drawn - target), 0 outside the picture, and sums of |differences|.
+
+    Args:
+        drawn, gradient: planes (3, H', W').
+        target: (3, H, W) uint8.
+        sums: (3 * H',) out.
+    """
+    rows, stride = drawn.shape[1], drawn.shape[2]
+    for task in prange(3 * rows):
+        channel, y = task // rows, task % rows
         total = float32(0)
-        if y < height:
-            for x in range(width):
-                difference = drawn[channel, y, x] - target[channel, y, x]
-                total += abs(difference)
-                sign = float32(difference > 0) - float32(difference < 0)
-                gradient[channel, y, x] += weight * sign
+        inside = width if y < height else 0
+        for x in range(inside):
+            difference = drawn[channel, y, x] - float32(target[channel, y, x]) * _SCALE
+            total += abs(difference)
+            sign = float32(difference > 0) - float32(difference < 0)
+            gradient[channel, y, x] = weight * sign
+        for x in range(inside, stride):
+            gradient[channel, y, x] = float32(0)
         sums[task] = total
 
 

@@ -3,7 +3,7 @@
 A level holds three spatial planes (xy, xz, yz) and three temporal ones (x, y, z against time).
 Channels come in chunks of 16, one vector: space is (3, chunks, R, R, 16) with the plane's second
 axis first, time is (3, chunks, T, R, 16). All points of a frame share one time, so the temporal
-planes collapse to three lines once a frame. The feature is the product of the six bilinear or
+planes collapse to three lines once a frame. All levels are served in one call. The feature is the product of the six bilinear or
 linear samples, positions clamped to the border.
 """
 
@@ -29,33 +29,27 @@ def cell(x, size):
     return i, u - float32(i)
 
 
-@parallel
-def collapse_time(planes, time, lines):
-    """Interpolate (3, chunks, T, R, 16) temporal planes at ``time`` in [-1, 1] to lines."""
-    chunks, size = planes.shape[1], planes.shape[2]
-    i, w = cell(float32(time), size)
-    for task in prange(3 * chunks):
-        axis, chunk = task // chunks, task % chunks
-        for r in range(planes.shape[3]):
-            for k in range(_LANES):
-                low, high = planes[axis, chunk, i, r, k], planes[axis, chunk, i + 1, r, k]
-                lines[axis, chunk, r, k] = low + (high - low) * w
+@inline
+def collapse(planes, time, lines, axis, chunk):
+    """Interpolate a chunk of one of (3, chunks, T, R, 16) temporal planes at ``time`` to a line."""
+    i, w = cell(time, planes.shape[2])
+    for r in range(planes.shape[3]):
+        for k in range(_LANES):
+            low, high = planes[axis, chunk, i, r, k], planes[axis, chunk, i + 1, r, k]
+            lines[axis, chunk, r, k] = low + (high - low) * w
 
 
-@parallel
-def spread_time(d_lines, time, d_planes):
-    """Write the gradient of the temporal planes: that of the lines at two times, else 0."""
-    chunks, size = d_planes.shape[1], d_planes.shape[2]
-    i, w = cell(float32(time), size)
-    for task in prange(3 * chunks):
-        axis, chunk = task // chunks, task % chunks
-        d_planes[axis, chunk, :i] = float32(0)
-        d_planes[axis, chunk, i + 2 :] = float32(0)
-        for r in range(d_planes.shape[3]):
-            for k in range(_LANES):
-                d = d_lines[axis, chunk, r, k]
-                d_planes[axis, chunk, i, r, k] = d * (_ONE - w)
-                d_planes[axis, chunk, i + 1, r, k] = d * w
+@inline
+def spread(d_lines, time, d_planes, axis, chunk):
+    """Write the gradient of a chunk of a temporal plane: that of the line at two times, else 0."""
+    i, w = cell(time, d_planes.shape[2])
+    d_planes[axis, chunk, :i] = float32(0)
+    d_planes[axis, chunk, i + 2 :] = float32(0)
+    for r in range(d_planes.shape[3]):
+        for k in range(_LANES):
+            d = d_lines[axis, chunk, r, k]
+            d_planes[axis, chunk, i, r, k] = d * (_ONE - w)
+            d_planes[axis, chunk, i + 1, r, k] = d * w
 
 
 @inline
@@ -82,28 +76,42 @@ def _linear(flat, at, w):
 
 
 @parallel
-def lookup(points, space, lines, features, offset):
-    """Write the features of (N, 3) points in [-1, 1]^3 to columns from ``offset`` on."""
-    n, size, chunks = points.shape[0], space.shape[2], space.shape[1]
-    planes, strips = space.reshape(-1), lines.reshape(-1)
-    out, width = features.reshape(-1), features.shape[1]
-    row, plane, strip = size * _LANES, size * size * _LANES, size * _LANES
+def lookup(points, scale, time, spaces, times, lines, features):
+    """Write the (N, C) features of (N, 3) points, which ``scale`` takes to [-1, 1].
+
+    Args:
+        spaces, times: the planes, one array per level.
+        lines: one array (3, chunks, R, 16) per level, out: the temporal planes at ``time``.
+        features: out, the levels side by side.
+    """
+    n, out, width = points.shape[0], features.reshape(-1), features.shape[1]
+    for level in range(len(spaces)):
+        for axis in range(3):
+            for chunk in range(spaces[level].shape[1]):
+                collapse(times[level], float32(time), lines[level], axis, chunk)
     for block in prange(_BLOCKS):
-        for i in range(n * block // _BLOCKS, n * (block + 1) // _BLOCKS):
-            ix, wx = cell(points[i, 0], size)
-            iy, wy = cell(points[i, 1], size)
-            iz, wz = cell(points[i, 2], size)
-            x_at, y_at, z_at = ix * _LANES, iy * _LANES, iz * _LANES
-            for c in range(chunks):
-                xy, xz, yz = c * plane, (chunks + c) * plane, (2 * chunks + c) * plane
-                x, y, z = c * strip, (chunks + c) * strip, (2 * chunks + c) * strip
-                value = _bilinear(planes, xy + iy * row + x_at, row, wx, wy)
-                value = value * _bilinear(planes, xz + iz * row + x_at, row, wx, wz)
-                value = value * _bilinear(planes, yz + iz * row + y_at, row, wy, wz)
-                value = value * _linear(strips, x + x_at, wx)
-                value = value * _linear(strips, y + y_at, wy)
-                value = value * _linear(strips, z + z_at, wz)
-                simd.store(out, i * width + offset + c * _LANES, value)
+        offset = 0
+        for level in range(len(spaces)):
+            space = spaces[level]
+            size, chunks = space.shape[2], space.shape[1]
+            planes, strips = space.reshape(-1), lines[level].reshape(-1)
+            row, plane, strip = size * _LANES, size * size * _LANES, size * _LANES
+            for i in range(n * block // _BLOCKS, n * (block + 1) // _BLOCKS):
+                ix, wx = cell(points[i, 0] * scale, size)
+                iy, wy = cell(points[i, 1] * scale, size)
+                iz, wz = cell(points[i, 2] * scale, size)
+                x_at, y_at, z_at = ix * _LANES, iy * _LANES, iz * _LANES
+                for c in range(chunks):
+                    xy, xz, yz = c * plane, (chunks + c) * plane, (2 * chunks + c) * plane
+                    x, y, z = c * strip, (chunks + c) * strip, (2 * chunks + c) * strip
+                    value = _bilinear(planes, xy + iy * row + x_at, row, wx, wy)
+                    value = value * _bilinear(planes, xz + iz * row + x_at, row, wx, wz)
+                    value = value * _bilinear(planes, yz + iz * row + y_at, row, wy, wz)
+                    value = value * _linear(strips, x + x_at, wx)
+                    value = value * _linear(strips, y + y_at, wy)
+                    value = value * _linear(strips, z + z_at, wz)
+                    simd.store(out, i * width + offset + c * _LANES, value)
+            offset += chunks * _LANES
 
 
 @inline
@@ -135,34 +143,42 @@ def _scatter_bilinear(flat, at, row, wx, wy, d):
 
 
 @parallel
-def lookup_backward(points, places, spaces, lines, d_features, d_spaces, d_lines, d_points):
-    """Write ``d_spaces`` and ``d_lines``; write the points' share of every chunk to ``d_points``.
+def lookup_backward(
+    points, scale, time, spaces, lines, d_features, d_spaces, d_times, d_lines, shares, d_points
+):
+    """Write the gradients of the planes and, if wanted, of the points.
 
     Every thread owns whole chunks of 16 channels, so that threads never write to one place and
     the sums do not depend on their number. Points outside [-1, 1] get no gradient along that axis.
 
     Args:
-        places: (C / 16, 2) level and chunk of every 16 columns of the features.
-        spaces, lines, d_spaces, d_lines: one array per level.
+        points, scale, time, spaces, lines: see ``lookup``.
         d_features: (N, C) of all levels side by side.
-        d_points: (C / 16, N, 3) out, to be summed over chunks, or (0, 0, 0) if not wanted.
+        d_spaces, d_times: out, one array per level.
+        d_lines: room for the gradients of ``lines``.
+        shares: (C / 16, N, 3) room for what each chunk adds to ``d_points``.
+        d_points: (N, 3) out, or (0, 3) if not wanted.
     """
     n, width, d_out = points.shape[0], d_features.shape[1], d_features.reshape(-1)
     for task in prange(width // _LANES):
-        level, c = places[task, 0], places[task, 1]
+        level, before = 0, 0
+        while task >= before + spaces[level].shape[1]:
+            before += spaces[level].shape[1]
+            level += 1
+        c = task - before
         space, d_space, d_line = spaces[level], d_spaces[level], d_lines[level]
         chunks, size = space.shape[1], space.shape[2]
         planes, strips = space.reshape(-1), lines[level].reshape(-1)
         d_planes, d_strips = d_space.reshape(-1), d_line.reshape(-1)
         row, plane, strip = size * _LANES, size * size * _LANES, size * _LANES
-        cells = _HALF * float32(size - 1)
+        cells = _HALF * float32(size - 1) * scale
         for axis in range(3):
             d_space[axis, c] = float32(0)
             d_line[axis, c] = float32(0)
         for i in range(n):
-            ix, wx = cell(points[i, 0], size)
-            iy, wy = cell(points[i, 1], size)
-            iz, wz = cell(points[i, 2], size)
+            ix, wx = cell(points[i, 0] * scale, size)
+            iy, wy = cell(points[i, 1] * scale, size)
+            iz, wz = cell(points[i, 2] * scale, size)
             xy = c * plane + iy * row + ix * _LANES
             xz = (chunks + c) * plane + iz * row + ix * _LANES
             yz = (2 * chunks + c) * plane + iz * row + iy * _LANES
@@ -189,15 +205,25 @@ def lookup_backward(points, places, spaces, lines, d_features, d_spaces, d_lines
                 gx = gx + hx + d_x * (simd.load(strips, x + _LANES) - simd.load(strips, x))
                 gy = gy + hy + d_y * (simd.load(strips, y + _LANES) - simd.load(strips, y))
                 gz = gz + hz + d_z * (simd.load(strips, z + _LANES) - simd.load(strips, z))
-                d_points[task, i, 0] = _inside(points[i, 0]) * cells * simd.reduce_sum(gx)
-                d_points[task, i, 1] = _inside(points[i, 1]) * cells * simd.reduce_sum(gy)
-                d_points[task, i, 2] = _inside(points[i, 2]) * cells * simd.reduce_sum(gz)
+                shares[task, i, 0] = _inside(points[i, 0] * scale) * cells * simd.reduce_sum(gx)
+                shares[task, i, 1] = _inside(points[i, 1] * scale) * cells * simd.reduce_sum(gy)
+                shares[task, i, 2] = _inside(points[i, 2] * scale) * cells * simd.reduce_sum(gz)
             _scatter_bilinear(d_planes, xy, row, wx, wy, d_xy)
             _scatter_bilinear(d_planes, xz, row, wx, wz, d_xz)
             _scatter_bilinear(d_planes, yz, row, wy, wz, d_yz)
             _scatter_linear(d_strips, x, wx, d_x)
             _scatter_linear(d_strips, y, wy, d_y)
             _scatter_linear(d_strips, z, wz, d_z)
+        for axis in range(3):
+            spread(d_line, float32(time), d_times[level], axis, c)
+    for block in prange(_BLOCKS):
+        rows = d_points.shape[0]
+        for i in range(rows * block // _BLOCKS, rows * (block + 1) // _BLOCKS):
+            for axis in range(3):
+                total = float32(0)
+                for task in range(shares.shape[0]):
+                    total += shares[task, i, axis]
+                d_points[i, axis] = total
 
 
 @inline

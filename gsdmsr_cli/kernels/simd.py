@@ -12,12 +12,12 @@ from collections.abc import Callable
 from typing import Any
 
 from llvmlite import ir
-from numba import types
+from numba import carray, types
 from numba.core import cgutils
 from numba.core.typing.templates import AbstractTemplate, infer_global, signature
 from numba.extending import intrinsic, lower_builtin, models, register_model
 
-from gsdmsr_cli.kernels.jit import FLAGS
+from gsdmsr_cli.kernels.jit import FLAGS, inline
 
 LANES = 16
 _FLOAT = ir.FloatType()
@@ -107,6 +107,20 @@ def store(_typing: Any, array: Any, index: Any, value: Any) -> Any:
         return context.get_dummy_value()
 
     return types.void(array, index, value), emit
+
+
+@intrinsic
+def _pointer(_typing: Any, address: Any) -> Any:
+    def emit(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        return builder.inttoptr(args[0], _FLOAT.as_pointer())
+
+    return types.CPointer(types.float32)(types.intp), emit
+
+
+@inline
+def at_address(address: int, length: int) -> Any:
+    """Return the ``length`` floats from ``address`` on as an array; whoever calls keeps them."""
+    return carray(_pointer(address), (length,))
 
 
 def _define_operator(symbol: Callable[..., Any], instruction: str) -> None:

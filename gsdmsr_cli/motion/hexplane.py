@@ -52,10 +52,8 @@ class HexPlaneMotion:
 
     def at(self, splats: Splats, time: float) -> Splats:
         """Return the deformed splats; time is mapped to the whole grid, [-1, 1]."""
-        points = splats.means / self.bound
-        if self.options.detach:
-            points = points.detach()
-        features = planes.lookup(self.levels, points, 2 * time - 1)
+        points = splats.means.detach() if self.options.detach else splats.means
+        features = planes.lookup(self.levels, points, 2 * time - 1, self.bound)
         return displace(splats, network.apply_network(self.layers, features))
 
     def take(self, rows: Tensor) -> None:

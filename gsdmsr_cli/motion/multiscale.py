@@ -82,20 +82,20 @@ class MultiscaleMotion:
         self._offset: Tensor | None = None
 
     def at(self, splats: Splats, time: float) -> Splats:
-        """Return the deformed splats; time is mapped to the whole grids, [-1, 1]."""
-        points = splats.means / self.bound
-        if self.options.detach:
-            points = points.detach()
-        when = 2 * time - 1
-        features = planes.lookup(self.coarse, points, when)
+        """Return the deformed splats; time is mapped to the whole grids, [-1, 1].
+
+        All grids are read in one go, the coarse one first: its decoder reads those columns only.
+        """
+        points = splats.means.detach() if self.options.detach else splats.means
+        levels = self.coarse + (self.fine if self.fine_active else [])
+        features = planes.lookup(levels, points, 2 * time - 1, self.bound)
         offset = network.apply_network(self.coarse_decoder, features)
         self._offset = offset
-        if self.fine_active:
-            fine = planes.lookup(self.fine, points, when)
-            seen = torch.cat([features, fine], dim=1) if self.options.pyramid else fine
-            deformation = network.apply_network(self.decoder, seen)
-            return displace(splats, deformation, offset)
-        return replace(splats, means=splats.means + offset)
+        if not self.fine_active:
+            return replace(splats, means=splats.means + offset)
+        if not self.options.pyramid:
+            features = features[:, self.options.coarse_channels :]
+        return displace(splats, network.apply_network(self.decoder, features), offset)
 
     def take(self, rows: Tensor) -> None:
         """Hold nothing per splat."""

@@ -136,30 +136,30 @@ class _Blend(Function):
         screen = [array(t) for t in (means2d, conics, opacities)]
         blending.pack(bins.splats, *screen, array(colours.contiguous()), records)
         rgb = torch.empty(3, rows * TILE, columns * TILE)
-        transmittance = torch.empty(rows * TILE, columns * TILE)
+        alpha = torch.empty(rows * TILE, columns * TILE)
         ends = np.empty(rows * columns, np.int32)
         blending.blend(
             records, bins.entries, bins.starts, bins.busiest, threads(), columns,
-            array(background.contiguous()), array(rgb), array(transmittance), ends,
+            array(background.contiguous()), array(rgb), array(alpha), ends,
         )  # fmt: skip
         ctx.bins, ctx.records, ctx.ends, ctx.columns = bins, records, ends, columns
-        ctx.padded = rgb, transmittance
+        ctx.padded = rgb, alpha
         ctx.save_for_backward(conics, opacities)
         ctx.set_materialize_grads(False)
-        return cropped(rgb, height, width), 1.0 - transmittance[:height, :width]
+        return cropped(rgb, height, width), alpha[:height, :width]
 
     @staticmethod
     @once_differentiable  # type: ignore[untyped-decorator]
     def backward(ctx: Any, d_rgb: Tensor | None, d_alpha: Tensor | None) -> tuple[Any, ...]:
         conics, opacities = ctx.saved_tensors
-        bins, (rgb, transmittance) = ctx.bins, ctx.padded
+        bins, (rgb, alpha) = ctx.bins, ctx.padded
         n = len(conics)
         sums = np.empty((blending.PARTS, n, blending.RECORD), np.float32)
         blending.blend_backward(
             ctx.records, bins.entries, bins.starts, bins.busiest, ctx.ends, ctx.columns,
-            array(rgb), array(transmittance),
-            array(padded(d_rgb, rgb.shape)),
-            array(padded(None if d_alpha is None else d_alpha[..., None], (1, *rgb.shape[1:]))[0]),
+            array(rgb), array(alpha),
+            array(torch.zeros_like(rgb) if d_rgb is None else padded(d_rgb, rgb.shape)),
+            array(torch.empty(0, 0) if d_alpha is None else padded(d_alpha[..., None], (1, *alpha.shape))[0]),
             sums,
         )  # fmt: skip
         d_means2d, d_conics, d_colours = (torch.empty(n, k) for k in (2, 3, 3))
@@ -176,13 +176,11 @@ def cropped(planes: Tensor, height: int, width: int) -> Tensor:
     return planes[:, :height, :width].permute(1, 2, 0)
 
 
-def padded(picture: Tensor | None, shape: tuple[int, ...]) -> Tensor:
+def padded(picture: Tensor, shape: tuple[int, ...]) -> Tensor:
     """Return a picture (H, W, C) as planes (C, H', W'), 0 outside, without a copy where possible.
 
     A picture that is itself a full view of such planes (see ``cropped``) is returned as they are.
     """
-    if picture is None:
-        return torch.zeros(shape)
     planes = picture.permute(2, 0, 1)
     if tuple(planes.shape) == tuple(shape):
         return planes.contiguous()

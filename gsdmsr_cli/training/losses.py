@@ -60,15 +60,17 @@ class _Photometric(Function):
     def forward(ctx: Any, rgb: Tensor, target: Tensor, ssim_weight: float) -> Tensor:
         height, width, _ = rgb.shape
         planes = _planes(rgb)
-        wanted, gradient = torch.empty_like(planes), torch.zeros_like(planes)
-        kernels.to_float(array(target), array(wanted))
-        pair = array(planes), array(wanted), height, width
+        gradient = torch.empty_like(planes)
         count = 3 * height * width
         sums = np.empty(3 * planes.shape[1])
-        kernels.l1(*pair, np.float32((1 - ssim_weight) / count), array(gradient), sums)
+        size = height, width
+        weight = np.float32((1 - ssim_weight) / count)
+        kernels.l1(array(planes), array(target), *size, weight, array(gradient), sums)
         loss = (1 - ssim_weight) * sums.sum() / count
         if ssim_weight > 0:
-            maps = torch.empty(3, *planes.shape)
+            wanted, maps = torch.empty_like(planes), torch.empty(3, *planes.shape)
+            kernels.to_float(array(target), array(wanted))
+            pair = array(planes), array(wanted), *size
             sums = np.empty(3 * -(-height // kernels.STRIP))
             kernels.ssim_maps(*pair, array(maps), sums)
             loss += ssim_weight * (1 - sums.sum() / count)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -12,6 +13,23 @@ from gsdmsr_cli.kernels import adam as kernels
 from gsdmsr_cli.tensors import array, has_kernels
 
 BETA1, BETA2, EPS = 0.9, 0.999, 1e-15
+
+
+class Move(NamedTuple):
+    """What one step does to one tensor.
+
+    Attributes:
+        tensor, gradient, first, second: contiguous, of one shape; the gradient is only read.
+        step: the number of the step, from 1.
+        rate: learning rate.
+    """
+
+    tensor: Tensor
+    gradient: Tensor
+    first: Tensor
+    second: Tensor
+    step: int
+    rate: float
 
 
 class Adam:
@@ -42,6 +60,8 @@ class Adam:
             multipliers: (N,) factor on the step of each row, for tensors of N rows; a row with
                 factor 0 keeps its values and moments untouched.
         """
+        by_kernel: list[Move] = []
+        by_twin: list[Move] = []
         for name, tensor in tensors.items():
             if tensor.grad is None:
                 continue
@@ -49,11 +69,13 @@ class Adam:
                 self.first[name], self.second[name] = (torch.zeros_like(tensor) for _ in "12")
                 self.steps[name] = 0
             self.steps[name] += 1
-            move = adam_step if has_kernels(tensor) else adam_step_twin
             moments = self.first[name], self.second[name]
             gradient = tensor.grad.contiguous()
-            move(tensor, gradient, *moments, self.steps[name], rates[name], multipliers)
+            moves = by_kernel if has_kernels(tensor) else by_twin
+            moves.append(Move(tensor, gradient, *moments, self.steps[name], rates[name]))
             tensor.grad = None
+        adam_steps(by_kernel, multipliers)
+        adam_steps_twin(by_twin, multipliers)
 
     def take(self, names: list[str], rows: Tensor, fresh: Tensor) -> None:
         """Follow a resize of the named tensors; rows that are ``fresh`` (M,) start without moments.
@@ -74,44 +96,30 @@ class Adam:
                 moments[name].zero_()
 
 
-def adam_step(
-    tensor: Tensor,
-    gradient: Tensor,
-    first: Tensor,
-    second: Tensor,
-    step: int,
-    rate: float,
-    multipliers: Tensor | None,
-) -> None:
-    """Make the ``step``-th step in place, by kernel."""
-    numbers = (rate, BETA1, BETA2, EPS, 1 - BETA1**step, 1 - BETA2**step)
-    scalars = tuple(np.float32(x) for x in numbers)
-    arrays = [array(t) for t in (tensor, gradient, first, second)]
-    if multipliers is None:
-        kernels.adam(*(a.reshape(-1) for a in arrays), *scalars)
-    else:
-        rows = (a.reshape(len(tensor), -1) for a in arrays)
-        kernels.adam_rows(*rows, array(multipliers), *scalars)
+def adam_steps(moves: Sequence[Move], multipliers: Tensor | None) -> None:
+    """Make all the moves in place, by one kernel."""
+    if not moves:
+        return
+    table, steps = np.empty((len(moves), 6), np.int64), np.empty((len(moves), 2), np.float32)
+    for i, (tensor, gradient, first, second, step, rate) in enumerate(moves):
+        width = 0 if multipliers is None else tensor.numel() // len(tensor)
+        table[i] = (*(t.data_ptr() for t in (tensor, gradient, first, second)), tensor.numel(), width)
+        steps[i] = rate / (1 - BETA1**step), 1 / (1 - BETA2**step)
+    factors = np.empty(0, np.float32) if multipliers is None else array(multipliers)
+    kernels.adam(table, steps, factors, *map(np.float32, (BETA1, BETA2, EPS)))
 
 
-def adam_step_twin(
-    tensor: Tensor,
-    gradient: Tensor,
-    first: Tensor,
-    second: Tensor,
-    step: int,
-    rate: float,
-    multipliers: Tensor | None,
-) -> None:
-    """Make the ``step``-th step in place, in plain torch, on any device and dtype."""
-    m = first * BETA1 + gradient * (1 - BETA1)
-    v = second * BETA2 + gradient.square() * (1 - BETA2)
-    move = rate / (1 - BETA1**step) * m / ((v / (1 - BETA2**step)).sqrt() + EPS)
-    if multipliers is not None:
-        factor = multipliers.to(tensor.dtype).reshape(-1, *[1] * (tensor.dim() - 1))
-        moved = factor != 0
-        move = torch.where(moved, factor * move, 0.0)
-        m, v = torch.where(moved, m, first), torch.where(moved, v, second)
-    tensor -= move
-    first.copy_(m)
-    second.copy_(v)
+def adam_steps_twin(moves: Sequence[Move], multipliers: Tensor | None) -> None:
+    """Make all the moves in place, in plain torch, on any device and dtype."""
+    for tensor, gradient, first, second, step, rate in moves:
+        m = first * BETA1 + gradient * (1 - BETA1)
+        v = second * BETA2 + gradient.square() * (1 - BETA2)
+        move = rate / (1 - BETA1**step) * m / ((v / (1 - BETA2**step)).sqrt() + EPS)
+        if multipliers is not None:
+            factor = multipliers.to(tensor.dtype).reshape(-1, *[1] * (tensor.dim() - 1))
+            moved = factor != 0
+            move = torch.where(moved, factor * move, 0.0)
+            m, v = torch.where(moved, m, first), torch.where(moved, v, second)
+        tensor -= move
+        first.copy_(m)
+        second.copy_(v)

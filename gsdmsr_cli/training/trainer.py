@@ -79,9 +79,7 @@ class Trainer:
         self._enter_phase(progress)
         count = self.preset.training.views_per_step
         drawn = [self._compare(self._next_view(), progress) for _ in range(count)]
-        loss = torch.stack([part for part, _ in drawn]).mean()
-        self._with_penalty(loss).backward()
-        value = float(loss.detach())
+        value = self._learn_from([loss for loss, _ in drawn])
         self.clock.step += 1
         if not math.isfinite(value):
             return self._skip()
@@ -103,11 +101,16 @@ class Trainer:
         loss = photometric_loss(frame.rgb, pictures.load(view), self.preset.losses.ssim)
         return loss, frame
 
-    def _with_penalty(self, loss: Tensor) -> Tensor:
-        if not self._moving or self.clock.step % PENALTY_EVERY:
-            return loss
-        penalty = self.model.motion.penalty()
-        return loss if penalty is None else loss + PENALTY_EVERY * penalty
+    def _learn_from(self, losses: list[Tensor]) -> float:
+        """Collect the gradients of the views' mean loss and of the penalty; return their sum."""
+        weights = [1 / len(losses)] * len(losses)
+        penalty = None
+        if self._moving and self.clock.step % PENALTY_EVERY == 0:
+            penalty = self.model.motion.penalty()
+        if penalty is not None:
+            losses, weights = [*losses, penalty], [*weights, float(PENALTY_EVERY)]
+        torch.autograd.backward(losses, [torch.tensor(weight) for weight in weights])
+        return sum(w * part.item() for w, part in zip(weights, losses, strict=True))
 
     def _next_view(self) -> View:
         """Return the next view of a random order that visits every view before any again."""

@@ -153,11 +153,14 @@ def test_time_collapses_linearly_and_spreads_as_the_adjoint(
     rng = np.random.default_rng(moments)
     grid = rng.normal(size=(3, 2, moments, size, 16)).astype(np.float32)
     lines, d_grid = np.empty((3, 2, size, 16), np.float32), np.empty_like(grid)
-    kernels.collapse_time(grid, time, lines)
+    chunks = [(axis, chunk) for axis in range(3) for chunk in range(2)]
+    for place in chunks:
+        kernels.collapse(grid, np.float32(time), lines, *place)
     weights = hats(torch.tensor([time], dtype=torch.float64), moments)[0].numpy()
     np.testing.assert_allclose(lines, np.einsum("t,actrk->acrk", weights, grid), atol=2e-6)
     d_lines = rng.normal(size=lines.shape).astype(np.float32)
-    kernels.spread_time(d_lines, time, d_grid)
+    for place in chunks:
+        kernels.spread(d_lines, np.float32(time), d_grid, *place)
     forward, backward = np.vdot(d_lines, lines), np.vdot(d_grid, grid)
     assert forward == pytest.approx(backward, rel=1e-4, abs=1e-4)
 

@@ -11,12 +11,20 @@ from hypothesis import strategies as st
 from kernel_checks import assert_same_on_threads, generator
 from torch import Tensor
 
-from gsdmsr_cli.training.optimizer import BETA1, BETA2, EPS, Adam, adam_step, adam_step_twin
+from gsdmsr_cli.training.optimizer import (
+    BETA1,
+    BETA2,
+    EPS,
+    Adam,
+    Move,
+    adam_steps,
+    adam_steps_twin,
+)
 
 SHAPES = [(1,), (16,), (7, 3), (33, 4, 3), (5, 4), (100,)]
 STEPS = 6
 
-Move = Callable[..., None]
+Steps = Callable[[list[Move], Tensor | None], None]
 
 
 def gradients_of(shape: tuple[int, ...], seed: int = 0) -> list[Tensor]:
@@ -27,7 +35,7 @@ def gradients_of(shape: tuple[int, ...], seed: int = 0) -> list[Tensor]:
 
 
 def moved(
-    move: Move,
+    steps: Steps,
     start: Tensor,
     gradients: list[Tensor],
     multipliers: Tensor | None = None,
@@ -37,7 +45,8 @@ def moved(
     values = start.clone()
     first, second = torch.zeros_like(values), torch.zeros_like(values)
     for step, gradient in enumerate(gradients, start=1):
-        move(values, gradient.to(values.dtype), first, second, step, rate, multipliers)
+        move = Move(values, gradient.to(values.dtype), first, second, step, rate)
+        steps([move], multipliers)
     return values, first, second
 
 
@@ -71,21 +80,21 @@ def test_steps_are_those_of_torch(shape: tuple[int, ...], ones: bool, dtype: tor
     torch.testing.assert_close(travelled, expected - start, atol=atol, rtol=rtol)
 
 
-@pytest.mark.parametrize("move", [adam_step, adam_step_twin])
-def test_the_multiplier_scales_the_step_of_its_row(move: Move) -> None:
+@pytest.mark.parametrize("steps", [adam_steps, adam_steps_twin])
+def test_the_multiplier_scales_the_step_of_its_row(steps: Steps) -> None:
     start, gradients = torch.zeros(5, 3), gradients_of((5, 3))[:1]
     factors = torch.tensor([1.0, 0.5, 2.0, 0.0, -1.0])
-    plain, first, second = moved(move, start, gradients, torch.ones(5))
-    scaled, first_scaled, second_scaled = moved(move, start, gradients, factors)
+    plain, first, second = moved(steps, start, gradients, torch.ones(5))
+    scaled, first_scaled, second_scaled = moved(steps, start, gradients, factors)
     torch.testing.assert_close(scaled, plain * factors[:, None], atol=1e-9, rtol=1e-6)
     active = factors != 0
     assert torch.equal(first_scaled[active], first[active])
     assert torch.equal(second_scaled[active], second[active])
 
 
-@pytest.mark.parametrize("move", [adam_step, adam_step_twin])
+@pytest.mark.parametrize("steps", [adam_steps, adam_steps_twin])
 @pytest.mark.parametrize("shape", [(6,), (6, 4, 3)], ids=str)
-def test_a_row_with_multiplier_0_keeps_every_bit(move: Move, shape: tuple[int, ...]) -> None:
+def test_a_row_with_multiplier_0_keeps_every_bit(steps: Steps, shape: tuple[int, ...]) -> None:
     """Even if its gradient is not a number."""
     rng = generator(2)
     values, first, second = (torch.rand(shape, generator=rng) for _ in range(3))
@@ -93,34 +102,34 @@ def test_a_row_with_multiplier_0_keeps_every_bit(move: Move, shape: tuple[int, .
     gradient = torch.randn(shape, generator=rng)
     factors = torch.tensor([1.0, 0.0, 0.5, 0.0, 1.0, 0.0])
     gradient[1], gradient[3] = float("nan"), float("inf")
-    move(values, gradient, first, second, 3, 0.01, factors)
+    steps([Move(values, gradient, first, second, 3, 0.01)], factors)
     skipped = factors == 0
     for now, old in zip((values, first, second), before, strict=True):
         assert torch.equal(now[skipped], old[skipped])
         assert (now[~skipped] != old[~skipped]).all()
 
 
-@pytest.mark.parametrize("move", [adam_step, adam_step_twin])
+@pytest.mark.parametrize("steps", [adam_steps, adam_steps_twin])
 @given(exponent=st.integers(-6, 6))
 @settings(max_examples=13, deadline=None)
-def test_the_size_of_gradients_does_not_matter(move: Move, exponent: int) -> None:
+def test_the_size_of_gradients_does_not_matter(steps: Steps, exponent: int) -> None:
     start, gradients = torch.zeros(9, 3), gradients_of((9, 3))
     scaled = [gradient * 2.0**exponent for gradient in gradients]
-    plain = moved(move, start, gradients)[0]
-    torch.testing.assert_close(moved(move, start, scaled)[0], plain, atol=1e-9, rtol=1e-5)
+    plain = moved(steps, start, gradients)[0]
+    torch.testing.assert_close(moved(steps, start, scaled)[0], plain, atol=1e-9, rtol=1e-5)
 
 
 def test_the_first_step_has_the_length_of_the_rate() -> None:
     start, gradient = torch.zeros(20), gradients_of((20,))[0]
-    values = moved(adam_step, start, [gradient], rate=0.03)[0]
+    values = moved(adam_steps, start, [gradient], rate=0.03)[0]
     torch.testing.assert_close(values, -0.03 * gradient.sign(), rtol=1e-5, atol=0)
 
 
 @pytest.mark.parametrize("rows", [None, torch.full((40,), 0.5)], ids=["flat", "rows"])
 def test_kernels_keep_pace_with_the_twin(rows: Tensor | None) -> None:
     start, gradients = torch.randn(40, 3, generator=generator(3)), gradients_of((40, 3))
-    ours = moved(adam_step, start, gradients, rows)
-    exact = moved(adam_step_twin, start.double(), gradients, rows)
+    ours = moved(adam_steps, start, gradients, rows)
+    exact = moved(adam_steps_twin, start.double(), gradients, rows)
     for found, truth in zip(ours, exact, strict=True):
         torch.testing.assert_close(found.double(), truth, atol=1e-6, rtol=5e-5)
 
@@ -171,4 +180,4 @@ def test_forget_clears_one_tensor() -> None:
 def test_results_do_not_depend_on_the_number_of_threads(rows: bool) -> None:
     start, gradients = torch.randn(333, 3, generator=generator(4)), gradients_of((333, 3))
     factors = torch.linspace(0, 1, 333) if rows else None
-    assert_same_on_threads(lambda: moved(adam_step, start, gradients, factors))
+    assert_same_on_threads(lambda: moved(adam_steps, start, gradients, factors))
