@@ -1,14 +1,45 @@
-"""JSON documents on disk that are whole or not there."""
+"""Files on disk that are whole or not there, and JSON documents."""
 
 from __future__ import annotations
 
-import contextlib
 import json
-from collections.abc import Mapping
+import uuid
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 from gsdmsr_cli.errors import DataError
+
+_PART = ".part"
+
+
+@contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """Yield a path beside ``path``, with its suffix, that takes its place if the block succeeds.
+
+    So a file is whole or as it was. The folder is made. What a killed process has left behind is
+    found by ``leftovers``.
+
+    Raises:
+        DataError: the file cannot be written.
+    """
+    beside = path.with_name(f".{path.stem}.{uuid.uuid4().hex}{_PART}{path.suffix}")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        yield beside
+        beside.replace(path)
+    except OSError as error:
+        reason = error.strerror or error
+        raise DataError(f"{path}: cannot be written: {reason}; is the disk full?") from error
+    finally:
+        with suppress(OSError):
+            beside.unlink()
+
+
+def leftovers(folder: Path) -> list[Path]:
+    """Return the unfinished files in ``folder``, ours and those of safetensors."""
+    return [*folder.glob(f".*{_PART}*"), *folder.glob(".tmp*")]
 
 
 def write_json(path: Path, document: Mapping[str, Any]) -> None:
@@ -19,16 +50,8 @@ def write_json(path: Path, document: Mapping[str, Any]) -> None:
         ValueError: the document holds NaN or infinity, which JSON does not have.
     """
     text = json.dumps(document, indent=2, allow_nan=False) + "\n"
-    beside = path.with_name(f"{path.name}.part")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
+    with replacing(path) as beside:
         beside.write_text(text, encoding="utf-8")
-        beside.replace(path)
-    except OSError as error:
-        with contextlib.suppress(OSError):
-            beside.unlink()
-        reason = error.strerror or error
-        raise DataError(f"{path}: cannot be written: {reason}; is the disk full?") from error
 
 
 def read_json(path: Path) -> dict[str, Any]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import os
 import struct
-import uuid
 import zlib
 from collections.abc import Iterable, Iterator
 from itertools import chain
@@ -19,6 +18,7 @@ import OpenImageIO
 from numpy.typing import NDArray
 
 from gsdmsr_cli.errors import DataError, GsdmsrError
+from gsdmsr_cli.files import replacing
 
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 
@@ -67,7 +67,7 @@ def write_png(path: Path, image: NDArray[np.uint8]) -> None:
     """
     order = {1: [0], 3: [2, 1, 0], 4: [2, 1, 0, 3]}[image.shape[2]]
     encoded = cv2.imencode(".png", np.ascontiguousarray(image[..., order]))[1]
-    with _replacing(path) as temporary:
+    with replacing(path) as temporary:
         temporary.write_bytes(encoded.tobytes())
 
 
@@ -110,7 +110,7 @@ def write_webm(path: Path, frames: Iterable[NDArray[np.uint8]], fps: float) -> N
     first = next(frames, None)
     if first is None:
         raise GsdmsrError(f"{path}: a video needs at least one frame")
-    with _replacing(path) as temporary:
+    with replacing(path) as temporary:
         temporary.touch()  # The encoder does not say why it cannot open a file; this does.
         written = _encode(temporary, chain([first], frames), first.shape, fps)
         # OpenCV drops what it could not write without a word, so count what is really there.
@@ -167,20 +167,6 @@ def _png_fault(path: Path, thorough: bool) -> str | None:
 def _unreadable(path: Path, message: str) -> str:
     reason = " ".join(message.split()) or "not a picture"
     return f"image {path} is damaged or not a picture ({reason}); restore the file"
-
-
-@contextlib.contextmanager
-def _replacing(path: Path) -> Iterator[Path]:
-    """Yield a new path beside ``path`` that takes its place if the block succeeds."""
-    temporary = path.with_name(f".{path.stem}.{uuid.uuid4().hex}{path.suffix}")
-    try:
-        yield temporary
-        temporary.replace(path)
-    except OSError as error:
-        raise DataError(f"cannot write {path}: {error.strerror or error}") from error
-    finally:
-        with contextlib.suppress(OSError):
-            temporary.unlink()
 
 
 def _encode(

@@ -26,7 +26,7 @@ from torch import Tensor
 
 from gsdmsr_cli import __version__, strict
 from gsdmsr_cli.errors import DataError, GsdmsrError, UsageError
-from gsdmsr_cli.files import read_json, write_json
+from gsdmsr_cli.files import leftovers, read_json, replacing, write_json
 from gsdmsr_cli.model import Model, load_model
 from gsdmsr_cli.motion import Facts
 from gsdmsr_cli.preset import Preset
@@ -129,12 +129,15 @@ class Run:
             return
         lines = self.log_path.read_text(encoding="utf-8").splitlines(keepends=True)
         kept = [line for line in lines if _is_up_to(step, line)]
-        beside = self.log_path.with_suffix(".part")
-        beside.write_text("".join(kept), encoding="utf-8")
-        beside.replace(self.log_path)
+        with replacing(self.log_path) as beside:
+            beside.write_text("".join(kept), encoding="utf-8")
 
     def save(self, checkpoint: Checkpoint) -> None:
-        """Replace the last checkpoint."""
+        """Replace the last checkpoint.
+
+        Raises:
+            DataError: it cannot be written; the earlier one is still there.
+        """
         state = {
             "schema": SCHEMA,
             "step": checkpoint.step,
@@ -143,15 +146,11 @@ class Run:
             "state": checkpoint.state,
         }
         tensors = {name: t.detach().contiguous() for name, t in checkpoint.tensors.items()}
-        beside = self.checkpoint_path.with_suffix(".part")
-        try:
-            save_file(tensors, beside, metadata={"gsdmsr": json.dumps(state)})
-            beside.replace(self.checkpoint_path)
-        except (OSError, SafetensorError) as error:
-            beside.unlink(missing_ok=True)
-            raise DataError(
-                f"{self.checkpoint_path}: cannot be written: {error}; is the disk full?"
-            ) from error
+        with replacing(self.checkpoint_path) as beside:
+            try:
+                save_file(tensors, beside, metadata={"gsdmsr": json.dumps(state)})
+            except SafetensorError as error:
+                raise OSError(str(error)) from error
 
     def load(self) -> Checkpoint:
         """Read the last checkpoint.
@@ -238,7 +237,7 @@ def continue_run(run: Run, preset: Preset, scene: Scene) -> Run:
         DataError: the scene is not the run's, or the folder cannot be written.
     """
     run.check_scene(scene)
-    for left in (*run.root.glob(".tmp*"), *run.root.glob("*.part")):
+    for left in leftovers(run.root):
         left.unlink()  # a killed training was writing them
     continued = replace(run, preset=preset, data=scene.root.resolve())
     continued.describe()

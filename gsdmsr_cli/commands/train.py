@@ -86,7 +86,8 @@ def run(
 
 def _prepare(scene: Scene, options: Preset, device: str) -> tuple[Trainer, dict[str, float]]:
     """Return a training ready for its first step, and how long that took."""
-    torch.set_num_threads(set_threads(options.training.threads))
+    set_threads(options.training.threads)
+    torch.set_num_threads(1)  # what torch itself computes in a step is too little to share
     engine = raster.best_engine(device)
     pictures = Pictures(
         BACKGROUNDS[options.data.background], options.data.downscale, options.data.cache_mib << 20

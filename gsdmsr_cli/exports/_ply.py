@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import BinaryIO
 
@@ -11,6 +10,7 @@ import torch
 from numpy.typing import NDArray
 
 from gsdmsr_cli.errors import DataError
+from gsdmsr_cli.files import replacing
 from gsdmsr_cli.splats import Splats
 
 Array = NDArray[np.float32]
@@ -51,7 +51,8 @@ def write_ply(path: Path, splats: Splats) -> None:
     names = _column_names(3 * (splats.sh.shape[1] - 1))
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(table)}"]
     header += [f"property float {name}" for name in names] + ["end_header", ""]
-    _write_atomically(path, "\n".join(header).encode("ascii") + table.tobytes())
+    with replacing(path) as beside:
+        beside.write_bytes("\n".join(header).encode("ascii") + table.tobytes())
 
 
 def read_ply(path: Path) -> Splats:
@@ -102,22 +103,6 @@ def _unit_quats(quats: torch.Tensor) -> torch.Tensor:
     wide = quats.double()
     length = wide.norm(dim=1, keepdim=True)
     return torch.where(length == 0, wide.new_tensor([1.0, 0.0, 0.0, 0.0]), wide / length)
-
-
-def _write_atomically(path: Path, content: bytes) -> None:
-    """Write a file under another name, then rename it."""
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        try:
-            part.write_bytes(content)
-            part.replace(path)
-        finally:
-            part.unlink(missing_ok=True)
-    except OSError as error:
-        raise DataError(
-            f"cannot write {path}: {error.strerror or error}; free space or choose another --out"
-        ) from error
 
 
 def _read_header(path: Path, file: BinaryIO) -> tuple[np.dtype[np.void], int]:

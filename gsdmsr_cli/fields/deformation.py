@@ -60,9 +60,9 @@ class _Displace(Function):
         deformation: Tensor,
         shift: Tensor,
     ) -> tuple[Tensor, Tensor, Tensor]:
-        stored = [t.contiguous() for t in (means, quats, log_scales)]
-        moved = tuple(torch.empty_like(tensor) for tensor in stored)
-        given = [array(t) for t in (*stored, deformation, shift)]
+        means, quats, log_scales = (t.contiguous() for t in (means, quats, log_scales))
+        moved = (torch.empty_like(means), torch.empty_like(quats), torch.empty_like(log_scales))
+        given = map(array, (means, quats, log_scales, deformation, shift))
         kernels.displace(*given, *map(array, moved))
         ctx.shifted = len(shift) > 0
         return moved

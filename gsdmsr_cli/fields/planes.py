@@ -67,9 +67,7 @@ def lookup(levels: Sequence[Level], points: Tensor, time: float, bound: float = 
     return lookup_twin(levels, points, time, bound)
 
 
-def lookup_twin(
-    levels: Sequence[Level], points: Tensor, time: float, bound: float = 1.0
-) -> Tensor:
+def lookup_twin(levels: Sequence[Level], points: Tensor, time: float, bound: float = 1.0) -> Tensor:
     """Return what ``lookup`` does, in plain torch, for any device and dtype."""
     places, when = points * (1 / bound), points.new_tensor(time)
     return torch.cat([_sample_level(level, places, when) for level in levels], dim=1)

@@ -15,8 +15,8 @@ _ONE = float32(1)
 
 
 VALUES, GRADIENTS, FIRST, SECOND, LENGTH, WIDTH = range(6)
-"""Columns of the table of tensors: four addresses, the number of values, and the values per row of a
-tensor whose rows have multipliers, else 0."""
+"""Columns of the table of tensors: four addresses, the number of values, and the values per row if
+rows have multipliers, else 0."""
 
 
 @inline

@@ -2,8 +2,8 @@
 
 Weights are (in, out), one array per layer, every width but the last a multiple of 16; the kernels
 pack them into one array in which the last is as well. ReLU follows every layer but the last. The
-work is cut into a fixed number of blocks of rows, so that sums over rows do not depend on the number
-of threads.
+work is cut into a fixed number of blocks of rows, so that sums over rows do not depend on the
+number of threads.
 """
 
 from __future__ import annotations

@@ -3,8 +3,8 @@
 A level holds three spatial planes (xy, xz, yz) and three temporal ones (x, y, z against time).
 Channels come in chunks of 16, one vector: space is (3, chunks, R, R, 16) with the plane's second
 axis first, time is (3, chunks, T, R, 16). All points of a frame share one time, so the temporal
-planes collapse to three lines once a frame. All levels are served in one call. The feature is the product of the six bilinear or
-linear samples, positions clamped to the border.
+planes collapse to three lines once a frame. The feature is the product of the six bilinear or
+linear samples, positions clamped to the border. One call serves all levels.
 """
 
 from __future__ import annotations

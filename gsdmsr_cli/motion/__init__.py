@@ -43,8 +43,11 @@ class Motion(Protocol):
     def advance(self, progress: float) -> None:
         """Enter the phase of training that belongs to ``progress`` in [0, 1]."""
 
-    def penalty(self) -> Tensor | None:
-        """Return the motion's regularisers at the present values, or None if it has none."""
+    def penalty(self, splats: Splats, time: float) -> Tensor | None:
+        """Return the motion's regularisers at the present values, or None if it has none.
+
+        What depends on positions or time is looked at for ``splats`` at ``time``.
+        """
 
     def tensors(self) -> dict[str, Tensor]:
         """Return everything that is trained or saved, by name, in a fixed order."""

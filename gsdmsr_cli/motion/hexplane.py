@@ -62,7 +62,7 @@ class HexPlaneMotion:
     def advance(self, progress: float) -> None:
         """Have no phases."""
 
-    def penalty(self) -> Tensor | None:
+    def penalty(self, splats: Splats, time: float) -> Tensor | None:
         """Return the plane regularisers."""
         o = self.options
         return planes.penalty(self.levels, o.space_smoothness, o.time_smoothness, o.time_stillness)

@@ -79,23 +79,26 @@ class MultiscaleMotion:
         features += options.coarse_channels if options.pyramid else 0
         widths = [features, options.width, options.width, OUTPUTS]
         self.decoder = [trained(layer) for layer in network.new_network(widths, generator)]
-        self._offset: Tensor | None = None
 
     def at(self, splats: Splats, time: float) -> Splats:
         """Return the deformed splats; time is mapped to the whole grids, [-1, 1].
 
         All grids are read in one go, the coarse one first: its decoder reads those columns only.
         """
-        points = splats.means.detach() if self.options.detach else splats.means
-        levels = self.coarse + (self.fine if self.fine_active else [])
-        features = planes.lookup(levels, points, 2 * time - 1, self.bound)
+        features = self._features(self.coarse + self._active(), splats, time)
         offset = network.apply_network(self.coarse_decoder, features)
-        self._offset = offset
         if not self.fine_active:
             return replace(splats, means=splats.means + offset)
         if not self.options.pyramid:
             features = features[:, self.options.coarse_channels :]
         return displace(splats, network.apply_network(self.decoder, features), offset)
+
+    def _active(self) -> list[planes.Level]:
+        return self.fine if self.fine_active else []
+
+    def _features(self, levels: list[planes.Level], splats: Splats, time: float) -> Tensor:
+        points = splats.means.detach() if self.options.detach else splats.means
+        return planes.lookup(levels, points, 2 * time - 1, self.bound)
 
     def take(self, rows: Tensor) -> None:
         """Hold nothing per splat."""
@@ -104,14 +107,15 @@ class MultiscaleMotion:
         """Let the fine field join after ``coarse_until``."""
         self.fine_active = progress >= self.options.coarse_until
 
-    def penalty(self) -> Tensor | None:
-        """Return the plane regularisers of the active grids, and L_reg of the last ``at``."""
+    def penalty(self, splats: Splats, time: float) -> Tensor | None:
+        """Return the plane regularisers of the active grids, and L_reg of the coarse offset."""
         o = self.options
-        levels = self.coarse + (self.fine if self.fine_active else [])
+        levels = self.coarse + self._active()
         value = planes.penalty(levels, o.space_smoothness, o.time_smoothness, o.time_stillness)
-        if self._offset is not None and o.offset_weight > 0:
-            energy = (self._offset / self.bound).square().sum(dim=1).mean()
-            value = value + o.offset_weight * energy
+        if o.offset_weight > 0:
+            features = self._features(self.coarse, splats, time)
+            offset = network.apply_network(self.coarse_decoder, features) / self.bound
+            value = value + o.offset_weight * offset.square().sum(dim=1).mean()
         return value
 
     def tensors(self) -> dict[str, Tensor]:

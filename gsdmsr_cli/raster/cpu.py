@@ -155,12 +155,14 @@ class _Blend(Function):
         bins, (rgb, alpha) = ctx.bins, ctx.padded
         n = len(conics)
         sums = np.empty((blending.PARTS, n, blending.RECORD), np.float32)
+        d_rgb = torch.zeros_like(rgb) if d_rgb is None else padded(d_rgb, rgb.shape)
+        if d_alpha is None:
+            d_alpha = torch.empty(0, 0)
+        else:
+            d_alpha = padded(d_alpha[..., None], (1, *alpha.shape))[0]
         blending.blend_backward(
             ctx.records, bins.entries, bins.starts, bins.busiest, ctx.ends, ctx.columns,
-            array(rgb), array(alpha),
-            array(torch.zeros_like(rgb) if d_rgb is None else padded(d_rgb, rgb.shape)),
-            array(torch.empty(0, 0) if d_alpha is None else padded(d_alpha[..., None], (1, *alpha.shape))[0]),
-            sums,
+            array(rgb), array(alpha), array(d_rgb), array(d_alpha), sums,
         )  # fmt: skip
         d_means2d, d_conics, d_colours = (torch.empty(n, k) for k in (2, 3, 3))
         d_opacities = torch.empty(n)

@@ -7,7 +7,6 @@ import math
 import torch
 from torch import Tensor
 
-from gsdmsr_cli.frame import Frame
 from gsdmsr_cli.geometry import quat_to_rotmat
 from gsdmsr_cli.preset import DensityOptions
 from gsdmsr_cli.splats import Splats
@@ -34,16 +33,17 @@ class DensityStatistics:
         self.views = torch.zeros(count)
 
     @torch.no_grad()
-    def observe(self, frame: Frame) -> None:
-        """Add one drawn view, after its backward pass.
+    def observe(self, gradient: Tensor, width: int, height: int) -> None:
+        """Add one drawn view.
 
         Splats that move no pixel, behind opaque ones for instance, do not count as drawn.
+
+        Args:
+            gradient: (N, 2) of the view's own loss, by the positions on the screen [1 / px].
+            width, height: of the view's picture [px].
         """
-        if frame.means2d.grad is None:
-            return
-        height, width = frame.alpha.shape
-        half = frame.means2d.new_tensor([0.5 * width, 0.5 * height])
-        length = (frame.means2d.grad * half).norm(dim=1)
+        half = gradient.new_tensor([0.5 * width, 0.5 * height])
+        length = (gradient * half).norm(dim=1)
         self.total += length
         self.views += length > 0
 

@@ -102,8 +102,10 @@ def adam_steps(moves: Sequence[Move], multipliers: Tensor | None) -> None:
         return
     table, steps = np.empty((len(moves), 6), np.int64), np.empty((len(moves), 2), np.float32)
     for i, (tensor, gradient, first, second, step, rate) in enumerate(moves):
-        width = 0 if multipliers is None else tensor.numel() // len(tensor)
-        table[i] = (*(t.data_ptr() for t in (tensor, gradient, first, second)), tensor.numel(), width)
+        size = tensor.numel()
+        width = 0 if multipliers is None else size // len(tensor)
+        addresses = (t.data_ptr() for t in (tensor, gradient, first, second))
+        table[i] = *addresses, size, width
         steps[i] = rate / (1 - BETA1**step), 1 / (1 - BETA2**step)
     factors = np.empty(0, np.float32) if multipliers is None else array(multipliers)
     kernels.adam(table, steps, factors, *map(np.float32, (BETA1, BETA2, EPS)))

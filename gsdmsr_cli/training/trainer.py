@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import reduce
+from statistics import fmean
 
 import torch
 from torch import Tensor
 
 from gsdmsr_cli.errors import GsdmsrError
-from gsdmsr_cli.frame import Frame
+from gsdmsr_cli.kernels.jit import set_threads, threads
 from gsdmsr_cli.model import MOVED_BY, STORED_AS, Model, load_model
 from gsdmsr_cli.motion import Facts, start_motion
 from gsdmsr_cli.pictures import HalvedPictures, Pictures
@@ -46,6 +50,23 @@ class Step:
     loss: float
 
 
+@dataclass(frozen=True, eq=False)
+class _Look:
+    """What one view has to say.
+
+    Attributes:
+        loss: of the view.
+        gradients: of the loss by every tensor of the model, None where it has no part.
+        on_screen: (N, 2) by the positions on the screen [1 / px].
+        size: width and height of the picture [px].
+    """
+
+    loss: float
+    gradients: Sequence[Tensor | None]
+    on_screen: Tensor
+    size: tuple[int, int]
+
+
 class Trainer:
     """A model in training on the train views of a scene.
 
@@ -68,6 +89,7 @@ class Trainer:
         self.optimizer = Adam()
         self.statistics = DensityStatistics(len(self.model.splats))
         self.clock = new_clock(preset.training)
+        self._pool: ThreadPoolExecutor | None = None
         self._queue: list[int] = []
         self._resets = 0
         self._moving = False
@@ -77,40 +99,64 @@ class Trainer:
         """Choose views, draw, compare, learn, grow and prune."""
         progress = self.clock.progress
         self._enter_phase(progress)
-        count = self.preset.training.views_per_step
-        drawn = [self._compare(self._next_view(), progress) for _ in range(count)]
-        value = self._learn_from([loss for loss, _ in drawn])
+        views = [self._next_view() for _ in range(self.preset.training.views_per_step)]
+        tensors = self.model.tensors()
+        looks = self._side_by_side(lambda view: self._look(view, tensors, progress), views)
+        value = fmean(look.loss for look in looks)
+        gradients = [look.gradients for look in looks]
+        if self._moving and self.clock.step % PENALTY_EVERY == 0:
+            penalty, further = self._penalise(tensors, views[0], len(looks))
+            value, gradients = value + penalty, [*gradients, further]
+        for tensor, *parts in zip(tensors.values(), *gradients, strict=True):
+            tensor.grad = _sum(parts)
         self.clock.step += 1
         if not math.isfinite(value):
             return self._skip()
         self._skipped = 0
-        for _, frame in drawn:
-            self.statistics.observe(frame)
-        self.optimizer.step(self.model.tensors(), self._rates(progress))
+        for look in looks:
+            self.statistics.observe(look.on_screen, *look.size)
+        self.optimizer.step(tensors, self._rates(progress))
         self._control_density(progress)
         return Step(value)
 
-    def _compare(self, view: View, progress: float) -> tuple[Tensor, Frame]:
+    def _side_by_side(self, look: Callable[[View], _Look], views: list[View]) -> list[_Look]:
+        """Look at all views, several at a time if there are threads for it.
+
+        Two views on a thread each take less time than one after the other on two threads: what
+        runs between the kernels overlaps, and no thread waits for another within a kernel.
+        """
+        at_once = min(len(views), threads())
+        if at_once == 1:
+            return [look(view) for view in views]
+        if self._pool is None:
+            share = threads() // at_once
+            self._pool = ThreadPoolExecutor(at_once, "view", lambda: _use_threads(share))
+        return list(self._pool.map(look, views))
+
+    def _look(self, view: View, tensors: Mapping[str, Tensor], progress: float) -> _Look:
+        """Draw a view, compare it, and take the gradients."""
         low = progress < self.preset.training.low_resolution_until
         pictures = self.small_pictures if low else self.pictures
         camera = pictures.camera(view)
         time = view.time if self._moving else None
         degree = self._sh_degree(progress)
         frame = draw(self.model, camera, time, self.engine, self.background, degree)
-        frame.means2d.retain_grad()
         loss = photometric_loss(frame.rgb, pictures.load(view), self.preset.losses.ssim)
-        return loss, frame
+        wanted = [*tensors.values(), frame.means2d]
+        *gradients, on_screen = torch.autograd.grad(loss, wanted, allow_unused=True)
+        return _Look(loss.item(), gradients, on_screen, (camera.width, camera.height))
 
-    def _learn_from(self, losses: list[Tensor]) -> float:
-        """Collect the gradients of the views' mean loss and of the penalty; return their sum."""
-        weights = [1 / len(losses)] * len(losses)
-        penalty = None
-        if self._moving and self.clock.step % PENALTY_EVERY == 0:
-            penalty = self.model.motion.penalty()
-        if penalty is not None:
-            losses, weights = [*losses, penalty], [*weights, float(PENALTY_EVERY)]
-        torch.autograd.backward(losses, [torch.tensor(weight) for weight in weights])
-        return sum(w * part.item() for w, part in zip(weights, losses, strict=True))
+    def _penalise(
+        self, tensors: Mapping[str, Tensor], view: View, looks: int
+    ) -> tuple[float, Sequence[Tensor | None]]:
+        """Return the penalty, and its gradients times the number of looks."""
+        motion, splats = self.model.motion, self.model.splats
+        penalty = motion.penalty(splats, view.time)
+        if penalty is None:
+            return 0.0, [None] * len(tensors)
+        wanted, factor = list(tensors.values()), PENALTY_EVERY * looks
+        gradients = torch.autograd.grad(penalty * factor, wanted, allow_unused=True)
+        return PENALTY_EVERY * penalty.item(), gradients
 
     def _next_view(self) -> View:
         """Return the next view of a random order that visits every view before any again."""
@@ -229,3 +275,18 @@ class Trainer:
 def facts_of(scene: Scene) -> Facts:
     """Return what a motion may know of the scene."""
     return Facts(bound=scene.bound, frames=len(scene.train_times))
+
+
+def _sum(parts: Sequence[Tensor | None]) -> Tensor | None:
+    """Return the sum of those that are there, in this order, or None.
+
+    The sum of the views' gradients, not the mean, moves the splats: Adam is indifferent to scale.
+    """
+    there = [part for part in parts if part is not None]
+    return reduce(torch.add, there) if there else None
+
+
+def _use_threads(count: int) -> None:
+    """Let the calling thread's kernels use ``count`` threads."""
+    set_threads(count)
+    torch.set_num_threads(1)

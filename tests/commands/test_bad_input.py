@@ -143,7 +143,7 @@ def test_a_document_that_cannot_be_written_leaves_nothing(tmp_path: Path) -> Non
 
 
 def test_what_a_killed_training_was_writing_is_cleared_away(run: Run, tiny_scene: Path) -> None:
-    for name in (".tmpAbc123", "checkpoint.part", "run.json.part"):
+    for name in (".tmpAbc123", ".checkpoint.4f.part.safetensors", ".run.07.part.json"):
         (run.root / name).touch()
     continue_run(run, run.preset, read_scene(tiny_scene))
     assert {path.name for path in run.root.iterdir()} == {"run.json", "checkpoint.safetensors"}

@@ -138,7 +138,7 @@ def test_full_disk_keeps_the_old_file_and_leaves_no_part(
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(Path, "write_bytes", full)
-    with pytest.raises(DataError, match=r"a\.ply: No space left on device"):
+    with pytest.raises(DataError, match=r"a\.ply: cannot be written: No space left on device"):
         write_ply(path, make_splats(5, 0))
     assert path.read_bytes() == old
     assert list(tmp_path.iterdir()) == [path]
@@ -146,7 +146,7 @@ def test_full_disk_keeps_the_old_file_and_leaves_no_part(
 
 def test_a_folder_in_the_place_of_the_file_is_bad_data(tmp_path: Path) -> None:
     (tmp_path / "a.ply").mkdir()
-    with pytest.raises(DataError, match="cannot write"):
+    with pytest.raises(DataError, match="cannot be written"):
         write_ply(tmp_path / "a.ply", make_splats(1, 0))
 
 

@@ -8,9 +8,7 @@ from dataclasses import replace
 import pytest
 import torch
 from kernel_checks import generator
-from torch import Tensor
 
-from gsdmsr_cli.frame import Frame
 from gsdmsr_cli.geometry import covariance
 from gsdmsr_cli.preset import DensityOptions
 from gsdmsr_cli.splats import Splats
@@ -57,19 +55,10 @@ def grown(
     return rows.tolist(), fresh.tolist(), after
 
 
-def frame_of(gradient: Tensor | None, width: int = 40, height: int = 20) -> Frame:
-    count = 3 if gradient is None else len(gradient)
-    means2d = torch.zeros(count, 2, requires_grad=True)
-    means2d.grad = gradient
-    picture = torch.zeros(height, width, 3)
-    return Frame(picture, picture[..., 0], None, torch.ones(count), means2d)
-
-
 def test_statistics_are_means_over_the_views_that_drew_a_splat() -> None:
     statistics = DensityStatistics(3)
-    statistics.observe(frame_of(torch.tensor([[0.3, 0.0], [0.0, 0.0], [0.03, 0.08]])))
-    statistics.observe(frame_of(torch.tensor([[0.0, 0.1], [0.0, 0.0], [0.0, 0.0]])))
-    statistics.observe(frame_of(None))
+    statistics.observe(torch.tensor([[0.3, 0.0], [0.0, 0.0], [0.03, 0.08]]), 40, 20)
+    statistics.observe(torch.tensor([[0.0, 0.1], [0.0, 0.0], [0.0, 0.0]]), 40, 20)
     # a pixel is 2 / 40 of the width and 2 / 20 of the height: times 20 and times 10
     expected = [(6.0 + 1.0) / 2, 0.0, 1.0]
     assert statistics.mean().tolist() == pytest.approx(expected)
@@ -80,7 +69,7 @@ def test_statistics_do_not_depend_on_the_resolution() -> None:
     gradient, statistics = torch.rand(5, 2, generator=generator()), []
     for scale in (1, 4):
         statistics.append(DensityStatistics(5))
-        statistics[-1].observe(frame_of(gradient / scale, 40 * scale, 20 * scale))
+        statistics[-1].observe(gradient / scale, 40 * scale, 20 * scale)
     torch.testing.assert_close(statistics[0].mean(), statistics[1].mean())
 
 
