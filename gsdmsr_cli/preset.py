@@ -109,6 +109,7 @@ class TrainingOptions:
         static_until: progress up to which nothing moves.
         views_per_step: pictures drawn and compared per step.
         low_resolution_until: progress up to which pictures of half the size are drawn; 0 is never.
+        average_from: progress from which the result is the mean of the steps' values; 1 is never.
         checkpoint_minutes: time between checkpoints [min].
         seed: seed of every random choice.
         threads: number of CPU threads; 0 takes all cores.
@@ -119,6 +120,7 @@ class TrainingOptions:
     static_until: float = 0.04
     views_per_step: int = 1
     low_resolution_until: float = 0.4
+    average_from: float = 0.85
     checkpoint_minutes: float = 2.0
     seed: int = 0
     threads: int = 0
@@ -127,7 +129,7 @@ class TrainingOptions:
         _require_at_least(self, 1, "steps", "views_per_step")
         known = self.budget is None or _duration(self.budget) is not None
         require(self, "budget", known, f"null or {_DURATION}")
-        _require_progress(self, "static_until", "low_resolution_until")
+        _require_progress(self, "static_until", "low_resolution_until", "average_from")
         _require_positive(self, "checkpoint_minutes")
         require(self, "seed", 0 <= self.seed < 2**32, "0 to 4294967295")
         _require_at_least(self, 0, "threads")

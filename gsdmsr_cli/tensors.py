@@ -11,7 +11,7 @@ from torch import Tensor
 
 def array(tensor: Tensor) -> NDArray[Any]:
     """Return the memory of a CPU tensor as an array, outside the graph."""
-    return tensor.detach().numpy()
+    return (tensor.detach() if tensor.requires_grad else tensor).numpy()
 
 
 def has_kernels(*tensors: Tensor) -> bool:
@@ -19,4 +19,4 @@ def has_kernels(*tensors: Tensor) -> bool:
 
     Others (CUDA, or float64 in tests) go to the plain torch twin of each kernel.
     """
-    return all(t.device.type == "cpu" and t.dtype == torch.float32 for t in tensors)
+    return all(t.is_cpu and t.dtype is torch.float32 for t in tensors)

@@ -18,30 +18,113 @@ _BLOCKS = 32
 
 _CHUNK = 64
 _LANES = simd.LANES
-_ROWS = 4
-_WIDE = 4 * _LANES
-_tile_4x4 = simd.make_product_tile(_ROWS, 4)
-_tile_4x1 = simd.make_product_tile(_ROWS, 1)
+_tile_4x4 = simd.make_product_tile(4, 4)
+_tile_8x2 = simd.make_product_tile(8, 2)
+_tile_8x1 = simd.make_product_tile(8, 1)
 _tile_1x4 = simd.make_product_tile(1, 4)
+_tile_1x2 = simd.make_product_tile(1, 2)
 _tile_1x1 = simd.make_product_tile(1, 1)
 
 
 @serial
 def _add_product(a, a0, a_row, a_step, rows, b, b0, b_step, count, c, c0, c_row, columns):
-    """c[r, j] += sum_k a[r, k] b[k, j] on flat arrays with given origins and strides."""
-    whole, wide = rows // _ROWS * _ROWS, columns // _WIDE * _WIDE
-    for r in range(0, whole, _ROWS):
-        a_at, c_at = a0 + r * a_row, c0 + r * c_row
-        for j in range(0, wide, _WIDE):
-            _tile_4x4(a, a_at, a_row, a_step, b, b0 + j, b_step, count, c, c_at + j, c_row)
-        for j in range(wide, columns, _LANES):
-            _tile_4x1(a, a_at, a_row, a_step, b, b0 + j, b_step, count, c, c_at + j, c_row)
-    for r in range(whole, rows):
-        a_at, c_at = a0 + r * a_row, c0 + r * c_row
-        for j in range(0, wide, _WIDE):
-            _tile_1x4(a, a_at, a_row, a_step, b, b0 + j, b_step, count, c, c_at + j, c_row)
-        for j in range(wide, columns, _LANES):
-            _tile_1x1(a, a_at, a_row, a_step, b, b0 + j, b_step, count, c, c_at + j, c_row)
+    """c[r, j] += sum_k a[r, k] b[k, j] on flat arrays with given origins and strides.
+
+    The columns are done four vectors at a time, then two, then one, each with as many rows as keep
+    about 16 sums in registers.
+    """
+    j = 0
+    while columns - j >= 4 * _LANES:
+        whole = rows // 4 * 4
+        for r in range(0, whole, 4):
+            _tile_4x4(
+                a,
+                a0 + r * a_row,
+                a_row,
+                a_step,
+                b,
+                b0 + j,
+                b_step,
+                count,
+                c,
+                c0 + r * c_row + j,
+                c_row,
+            )
+        for r in range(whole, rows):
+            _tile_1x4(
+                a,
+                a0 + r * a_row,
+                a_row,
+                a_step,
+                b,
+                b0 + j,
+                b_step,
+                count,
+                c,
+                c0 + r * c_row + j,
+                c_row,
+            )
+        j += 4 * _LANES
+    whole = rows // 8 * 8
+    while columns - j >= 2 * _LANES:
+        for r in range(0, whole, 8):
+            _tile_8x2(
+                a,
+                a0 + r * a_row,
+                a_row,
+                a_step,
+                b,
+                b0 + j,
+                b_step,
+                count,
+                c,
+                c0 + r * c_row + j,
+                c_row,
+            )
+        for r in range(whole, rows):
+            _tile_1x2(
+                a,
+                a0 + r * a_row,
+                a_row,
+                a_step,
+                b,
+                b0 + j,
+                b_step,
+                count,
+                c,
+                c0 + r * c_row + j,
+                c_row,
+            )
+        j += 2 * _LANES
+    if columns > j:
+        for r in range(0, whole, 8):
+            _tile_8x1(
+                a,
+                a0 + r * a_row,
+                a_row,
+                a_step,
+                b,
+                b0 + j,
+                b_step,
+                count,
+                c,
+                c0 + r * c_row + j,
+                c_row,
+            )
+        for r in range(whole, rows):
+            _tile_1x1(
+                a,
+                a0 + r * a_row,
+                a_row,
+                a_step,
+                b,
+                b0 + j,
+                b_step,
+                count,
+                c,
+                c0 + r * c_row + j,
+                c_row,
+            )
 
 
 @inline

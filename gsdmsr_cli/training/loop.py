@@ -157,7 +157,7 @@ class _Watch:
     def _psnr(self) -> float | None:
         trainer, view = self.trainer, self.view
         camera, target = trainer.pictures.camera(view), trainer.pictures.load(view)
-        frame = draw(trainer.model, camera, view.time, trainer.engine, trainer.background)
+        frame = draw(trainer.result(), camera, view.time, trainer.engine, trainer.background)
         value = psnr(quantize(frame.rgb), target.permute(1, 2, 0) / 255)
         return None if math.isnan(value) else min(value, PSNR_CAP)
 

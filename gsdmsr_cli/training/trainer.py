@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import reduce
 from statistics import fmean
 
 import torch
 from torch import Tensor
 
 from gsdmsr_cli.errors import GsdmsrError
-from gsdmsr_cli.kernels.jit import set_threads, threads
 from gsdmsr_cli.model import MOVED_BY, STORED_AS, Model, load_model
 from gsdmsr_cli.motion import Facts, start_motion
 from gsdmsr_cli.pictures import HalvedPictures, Pictures
@@ -22,6 +19,7 @@ from gsdmsr_cli.raster import Engine
 from gsdmsr_cli.run import Checkpoint
 from gsdmsr_cli.scene import Scene, View
 from gsdmsr_cli.splatting import draw
+from gsdmsr_cli.training import averaging
 from gsdmsr_cli.training.density import DensityStatistics, grow_and_prune, reset_opacities
 from gsdmsr_cli.training.initial import initial_splats
 from gsdmsr_cli.training.losses import photometric_loss
@@ -40,7 +38,7 @@ PATIENCE = 20
 BACKGROUNDS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
 
 _PER_SPLAT = ("means", "quats", "log_scales", "logit_opacities", "sh")
-_FIRST, _SECOND, _SEEN = "adam.first.", "adam.second.", "density."
+_FIRST, _SECOND, _SEEN, _LAST = "adam.first.", "adam.second.", "density.", "last."
 
 
 @dataclass(frozen=True)
@@ -88,8 +86,8 @@ class Trainer:
         self.model = Model(splats, motion)
         self.optimizer = Adam()
         self.statistics = DensityStatistics(len(self.model.splats))
+        self.average = averaging.Average()
         self.clock = new_clock(preset.training)
-        self._pool: ThreadPoolExecutor | None = None
         self._queue: list[int] = []
         self._resets = 0
         self._moving = False
@@ -101,14 +99,16 @@ class Trainer:
         self._enter_phase(progress)
         views = [self._next_view() for _ in range(self.preset.training.views_per_step)]
         tensors = self.model.tensors()
-        looks = self._side_by_side(lambda view: self._look(view, tensors, progress), views)
+        looks = [self._look(view, tensors, progress) for view in views]
         value = fmean(look.loss for look in looks)
         gradients = [look.gradients for look in looks]
+        weights = [1 / len(looks)] * len(looks)
         if self._moving and self.clock.step % PENALTY_EVERY == 0:
-            penalty, further = self._penalise(tensors, views[0], len(looks))
-            value, gradients = value + penalty, [*gradients, further]
+            penalty, further = self._penalise(tensors, views[0])
+            value += PENALTY_EVERY * penalty
+            gradients, weights = [*gradients, further], [*weights, PENALTY_EVERY]
         for tensor, *parts in zip(tensors.values(), *gradients, strict=True):
-            tensor.grad = _sum(parts)
+            tensor.grad = _sum(parts, weights)
         self.clock.step += 1
         if not math.isfinite(value):
             return self._skip()
@@ -117,21 +117,15 @@ class Trainer:
             self.statistics.observe(look.on_screen, *look.size)
         self.optimizer.step(tensors, self._rates(progress))
         self._control_density(progress)
+        if progress >= self.preset.training.average_from and self.clock.step % averaging.EVERY == 0:
+            self.average.add(self.model.tensors())
         return Step(value)
 
-    def _side_by_side(self, look: Callable[[View], _Look], views: list[View]) -> list[_Look]:
-        """Look at all views, several at a time if there are threads for it.
-
-        Two views on a thread each take less time than one after the other on two threads: what
-        runs between the kernels overlaps, and no thread waits for another within a kernel.
-        """
-        at_once = min(len(views), threads())
-        if at_once == 1:
-            return [look(view) for view in views]
-        if self._pool is None:
-            share = threads() // at_once
-            self._pool = ThreadPoolExecutor(at_once, "view", lambda: _use_threads(share))
-        return list(self._pool.map(look, views))
+    def result(self) -> Model:
+        """Return the model that the training has led to: the average where there is one yet."""
+        if not self.average.count:
+            return self.model
+        return load_model(self.average.tensors, self.preset.motion, self.facts, self.clock.progress)
 
     def _look(self, view: View, tensors: Mapping[str, Tensor], progress: float) -> _Look:
         """Draw a view, compare it, and take the gradients."""
@@ -147,16 +141,14 @@ class Trainer:
         return _Look(loss.item(), gradients, on_screen, (camera.width, camera.height))
 
     def _penalise(
-        self, tensors: Mapping[str, Tensor], view: View, looks: int
+        self, tensors: Mapping[str, Tensor], view: View
     ) -> tuple[float, Sequence[Tensor | None]]:
-        """Return the penalty, and its gradients times the number of looks."""
-        motion, splats = self.model.motion, self.model.splats
-        penalty = motion.penalty(splats, view.time)
+        """Return the penalty and its gradients."""
+        penalty = self.model.motion.penalty(self.model.splats, view.time)
         if penalty is None:
             return 0.0, [None] * len(tensors)
-        wanted, factor = list(tensors.values()), PENALTY_EVERY * looks
-        gradients = torch.autograd.grad(penalty * factor, wanted, allow_unused=True)
-        return PENALTY_EVERY * penalty.item(), gradients
+        gradients = torch.autograd.grad(penalty, list(tensors.values()), allow_unused=True)
+        return penalty.item(), gradients
 
     def _next_view(self) -> View:
         """Return the next view of a random order that visits every view before any again."""
@@ -216,12 +208,17 @@ class Trainer:
             with torch.no_grad():
                 for name, tensor in self.model.splats.tensors().items():
                     tensor.copy_(getattr(grown, name))
-            self.optimizer.take(self._per_splat(), rows, fresh)
+            names = self._per_splat()
+            self.optimizer.take(names, rows, fresh)
+            self.average.take(names, rows)
+            if fresh.any():
+                self.average.forget()
             self.statistics = DensityStatistics(len(rows))
         if self._resets < len(options.reset_at) and progress >= options.reset_at[self._resets]:
             self._resets += 1
             reset_opacities(self.model.splats)
             self.optimizer.forget(STORED_AS + "logit_opacities")
+            self.average.forget()
 
     def _skip(self) -> Step:
         """Drop a step whose loss is not finite; give up after many in a row."""
@@ -236,8 +233,11 @@ class Trainer:
         return Step(math.nan)
 
     def checkpoint(self) -> Checkpoint:
-        """Return everything needed to go on from here."""
+        """Return the result so far and everything needed to go on from here."""
         tensors = dict(self.model.tensors())
+        if self.average.count:
+            tensors = {_LAST + name: tensor for name, tensor in tensors.items()}
+            tensors |= self.average.tensors
         tensors |= {_FIRST + name: t for name, t in self.optimizer.first.items()}
         tensors |= {_SECOND + name: t for name, t in self.optimizer.second.items()}
         tensors[_SEEN + "total"] = self.statistics.total
@@ -248,6 +248,7 @@ class Trainer:
             "resets": self._resets,
             "moving": self._moving,
             "adam_steps": self.optimizer.steps,
+            "averaged": self.average.count,
         }
         clock = self.clock
         return Checkpoint(clock.step, clock.progress, clock.elapsed, tensors, state)
@@ -255,7 +256,13 @@ class Trainer:
     def restore(self, checkpoint: Checkpoint) -> None:
         """Go on from a checkpoint of the same preset and scene."""
         tensors, state = checkpoint.tensors, checkpoint.state
-        self.model = load_model(tensors, self.preset.motion, self.facts, checkpoint.progress)
+        self.average = averaging.Average()
+        self.average.count = int(state["averaged"])
+        last = dict(tensors)
+        if self.average.count:
+            last = {n.removeprefix(_LAST): t for n, t in tensors.items() if n.startswith(_LAST)}
+            self.average.tensors = {name: tensors[name] for name in last}
+        self.model = load_model(last, self.preset.motion, self.facts, checkpoint.progress)
         for moments, prefix in ((self.optimizer.first, _FIRST), (self.optimizer.second, _SECOND)):
             moments.update(
                 {n.removeprefix(prefix): t for n, t in tensors.items() if n.startswith(prefix)}
@@ -277,16 +284,14 @@ def facts_of(scene: Scene) -> Facts:
     return Facts(bound=scene.bound, frames=len(scene.train_times))
 
 
-def _sum(parts: Sequence[Tensor | None]) -> Tensor | None:
-    """Return the sum of those that are there, in this order, or None.
-
-    The sum of the views' gradients, not the mean, moves the splats: Adam is indifferent to scale.
-    """
-    there = [part for part in parts if part is not None]
-    return reduce(torch.add, there) if there else None
-
-
-def _use_threads(count: int) -> None:
-    """Let the calling thread's kernels use ``count`` threads."""
-    set_threads(count)
-    torch.set_num_threads(1)
+def _sum(parts: Sequence[Tensor | None], weights: Sequence[float]) -> Tensor | None:
+    """Return the weighted sum of the parts that are there, in this order, or None."""
+    total: Tensor | None = None
+    for part, weight in zip(parts, weights, strict=True):
+        if part is None:
+            continue
+        if total is None:
+            total = part if weight == 1 else part * weight
+        else:
+            total = torch.add(total, part, alpha=weight)
+    return total
