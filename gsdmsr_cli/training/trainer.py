@@ -117,9 +117,15 @@ class Trainer:
             self.statistics.observe(look.on_screen, *look.size)
         self.optimizer.step(tensors, self._rates(progress))
         self._control_density(progress)
-        if progress >= self.preset.training.average_from and self.clock.step % averaging.EVERY == 0:
-            self.average.add(self.model.tensors())
+        if self.clock.step % averaging.EVERY == 0:
+            self._average(progress)
         return Step(value)
+
+    def _average(self, progress: float) -> None:
+        if progress >= self.preset.training.average_from:
+            self.average.add(self.model.tensors())
+        else:
+            self.average.forget()  # a resumed training may have gone back in progress
 
     def result(self) -> Model:
         """Return the model that the training has led to: the average where there is one yet."""

@@ -76,6 +76,16 @@ def test_without_an_end_to_average_the_result_is_the_model(tiny_scene: Path) -> 
     assert trainer.result() is trainer.model
 
 
+def test_going_back_in_progress_drops_the_average(tiny_scene: Path) -> None:
+    preset = preset_of(f"training.steps={2 * EVERY}", "training.average_from=0.5")
+    trainer = trainer_of(tiny_scene, preset)
+    after(trainer, 2 * EVERY)
+    assert trainer.result() is not trainer.model
+    trainer.clock.steps = 10 * EVERY
+    after(trainer, EVERY)
+    assert trainer.result() is trainer.model
+
+
 @pytest.mark.parametrize("done", [EVERY, 3 * EVERY + 3])
 def test_a_checkpoint_holds_the_result_and_what_to_go_on_from(tiny_scene: Path, done: int) -> None:
     preset = preset_of(f"training.steps={4 * EVERY}", "training.average_from=0.5")
