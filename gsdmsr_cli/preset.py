@@ -20,6 +20,9 @@ _SECONDS = {"s": 1.0, "m": 60.0, "h": 3600.0}
 _DURATION = "a positive duration such as 90s, 8m or 1.5h"
 _PROGRESS = "a progress from 0 to 1"
 
+BACKGROUNDS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
+"""The colours that pictures may be laid on."""
+
 
 def _duration(text: str) -> float | None:
     match = re.fullmatch(r"(\d+(?:\.\d+)?)([smh])", text)

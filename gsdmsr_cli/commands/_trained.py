@@ -12,9 +12,9 @@ from gsdmsr_cli.errors import DataError
 from gsdmsr_cli.evaluation.protocol import Studio
 from gsdmsr_cli.formats import read_scene
 from gsdmsr_cli.pictures import Pictures
+from gsdmsr_cli.preset import BACKGROUNDS
 from gsdmsr_cli.run import Checkpoint, Run, open_run
 from gsdmsr_cli.scene import Scene
-from gsdmsr_cli.training.trainer import BACKGROUNDS
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,12 +21,12 @@ from gsdmsr_cli.formats import read_scene
 from gsdmsr_cli.kernels.jit import set_threads
 from gsdmsr_cli.motion import motion_options
 from gsdmsr_cli.pictures import Pictures
-from gsdmsr_cli.preset import Preset, load_preset
+from gsdmsr_cli.preset import BACKGROUNDS, Preset, load_preset
 from gsdmsr_cli.run import SCHEMA, Checkpoint, Run, continue_run, create_run, open_run, refuse_used
 from gsdmsr_cli.scene import Scene
 from gsdmsr_cli.training.loop import train
 from gsdmsr_cli.training.schedule import new_clock
-from gsdmsr_cli.training.trainer import BACKGROUNDS, Trainer
+from gsdmsr_cli.training.trainer import Trainer
 from gsdmsr_cli.training.warm_up import warm_up
 
 MAY_CHANGE = {

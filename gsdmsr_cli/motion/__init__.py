@@ -66,9 +66,7 @@ def motion_options(settings: Mapping[str, Any]) -> Any:
     Raises:
         UsageError: no motion has that name, or an option is unknown or out of range.
     """
-    module = plugins.load(__name__, str(settings.get("name", "")))
-    located = settings if isinstance(settings, strict.Located) else strict.Located(settings)
-    return strict.build(module.Options, located.without("name"), "motion")
+    return _plugin(settings)[1]
 
 
 def start_motion(
@@ -79,7 +77,13 @@ def start_motion(
     Raises:
         UsageError: see ``motion_options``.
     """
-    options = motion_options(settings)
-    module = plugins.load(__name__, str(settings["name"]))
+    module, options = _plugin(settings)
     motion: Motion = module.start(options, facts, count, generator)
     return motion
+
+
+def _plugin(settings: Mapping[str, Any]) -> tuple[Any, Any]:
+    """Return the motion's module and its options."""
+    module: Any = plugins.load(__name__, str(settings.get("name", "")))
+    located = settings if isinstance(settings, strict.Located) else strict.Located(settings)
+    return module, strict.build(module.Options, located.without("name"), "motion")

@@ -14,7 +14,7 @@ from gsdmsr_cli.errors import GsdmsrError
 from gsdmsr_cli.model import MOVED_BY, STORED_AS, Model, load_model
 from gsdmsr_cli.motion import Facts, start_motion
 from gsdmsr_cli.pictures import HalvedPictures, Pictures
-from gsdmsr_cli.preset import Preset
+from gsdmsr_cli.preset import BACKGROUNDS, Preset
 from gsdmsr_cli.raster import Engine
 from gsdmsr_cli.run import Checkpoint
 from gsdmsr_cli.scene import Scene, View
@@ -34,8 +34,6 @@ PRUNE_EVERY = 500
 
 PATIENCE = 20
 """Consecutive steps without a finite loss after which training gives up."""
-
-BACKGROUNDS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
 
 _PER_SPLAT = ("means", "quats", "log_scales", "logit_opacities", "sh")
 _FIRST, _SECOND, _SEEN, _LAST = "adam.first.", "adam.second.", "density.", "last."

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import numba
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -191,33 +192,18 @@ def test_two_dimensional_arrays_are_indexed_flat() -> None:
     assert np.array_equal(out.ravel()[8:24], x.ravel()[24:40])
 
 
-_tile_4x4 = simd.make_product_tile(4, 4)
-_tile_4x1 = simd.make_product_tile(4, 1)
-_tile_1x4 = simd.make_product_tile(1, 4)
-_tile_1x1 = simd.make_product_tile(1, 1)
+def applied(rows: int, columns: int) -> Any:
+    """Return a kernel that does nothing but one tile."""
+    tile = simd.make_product_tile(rows, columns)
+
+    @numba.njit
+    def apply(a, a0, a_row, a_step, b, b0, b_step, count, c, c0, c_row):
+        tile(a, a0, a_row, a_step, b, b0, b_step, count, c, c0, c_row)
+
+    return apply
 
 
-@serial
-def apply_4x4(a, a0, a_row, a_step, b, b0, b_step, count, c, c0, c_row):
-    _tile_4x4(a, a0, a_row, a_step, b, b0, b_step, count, c, c0, c_row)
-
-
-@serial
-def apply_4x1(a, a0, a_row, a_step, b, b0, b_step, count, c, c0, c_row):
-    _tile_4x1(a, a0, a_row, a_step, b, b0, b_step, count, c, c0, c_row)
-
-
-@serial
-def apply_1x4(a, a0, a_row, a_step, b, b0, b_step, count, c, c0, c_row):
-    _tile_1x4(a, a0, a_row, a_step, b, b0, b_step, count, c, c0, c_row)
-
-
-@serial
-def apply_1x1(a, a0, a_row, a_step, b, b0, b_step, count, c, c0, c_row):
-    _tile_1x1(a, a0, a_row, a_step, b, b0, b_step, count, c, c0, c_row)
-
-
-TILES = {(4, 4): apply_4x4, (4, 1): apply_4x1, (1, 4): apply_1x4, (1, 1): apply_1x1}
+TILES = {shape: applied(*shape) for shape in ((4, 4), (8, 2), (8, 1), (1, 4), (1, 2), (1, 1))}
 
 
 @pytest.mark.parametrize("transposed", [False, True])
