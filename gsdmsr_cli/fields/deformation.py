@@ -34,7 +34,7 @@ def displace(splats: Splats, deformation: Tensor, shift: Tensor | None = None) -
     further = deformation.new_empty(0, 3) if shift is None else shift
     stored = splats.means, splats.quats, splats.log_scales
     if has_kernels(*stored, deformation, further):
-        means, quats, log_scales = _Displace.apply(*stored, deformation, further)
+        means, quats, log_scales = _Displace.apply(*stored, deformation, further, shift is not None)
         return replace(splats, means=means, quats=quats, log_scales=log_scales)
     return displace_twin(splats, deformation, shift)
 
@@ -59,12 +59,13 @@ class _Displace(Function):
         log_scales: Tensor,
         deformation: Tensor,
         shift: Tensor,
+        shifted: bool,
     ) -> tuple[Tensor, Tensor, Tensor]:
         means, quats, log_scales = (t.contiguous() for t in (means, quats, log_scales))
         moved = (torch.empty_like(means), torch.empty_like(quats), torch.empty_like(log_scales))
         given = map(array, (means, quats, log_scales, deformation, shift))
         kernels.displace(*given, *map(array, moved))
-        ctx.shifted = len(shift) > 0
+        ctx.shifted = shifted
         return moved
 
     @staticmethod
@@ -74,7 +75,8 @@ class _Displace(Function):
         d_deformation = torch.empty(len(d_means), OUTPUTS)
         incoming = [array(d) for d in (d_means, d_quats, d_log_scales)]
         kernels.displace_backward(*incoming, array(d_deformation))
-        return d_means, d_quats, d_log_scales, d_deformation, d_means if ctx.shifted else None
+        d_shift = d_means if ctx.shifted else None
+        return d_means, d_quats, d_log_scales, d_deformation, d_shift, None
 
 
 def time_nodes(frames: int, cells_per_frame: float, least: int = 8) -> int:

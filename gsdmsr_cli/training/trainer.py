@@ -92,7 +92,7 @@ class Trainer:
         self._skipped = 0
 
     def step(self) -> Step:
-        """Choose views, draw, compare, learn, grow and prune."""
+        """Choose views, look at each, add up their gradients, learn, grow and prune."""
         progress = self.clock.progress
         self._enter_phase(progress)
         views = [self._next_view() for _ in range(self.preset.training.views_per_step)]
