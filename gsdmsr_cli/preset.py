@@ -122,8 +122,8 @@ class TrainingOptions:
     budget: str | None = None
     static_until: float = 0.04
     views_per_step: int = 1
-    low_resolution_until: float = 0.4
-    average_from: float = 0.85
+    low_resolution_until: float = 0.3
+    average_from: float = 0.9
     checkpoint_minutes: float = 2.0
     seed: int = 0
     threads: int = 0
@@ -198,7 +198,7 @@ class DensityOptions:
 
     every: int = 100
     start: int = 300
-    until: float = 0.45
+    until: float = 0.35
     gradient: float = 5e-4
     split_scale: float = 0.01
     prune_scale: float = 0.1
