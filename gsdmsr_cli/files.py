@@ -18,15 +18,14 @@ _PART = ".part"
 def replacing(path: Path) -> Iterator[Path]:
     """Yield a path beside ``path``, with its suffix, that takes its place if the block succeeds.
 
-    So a file is whole or as it was. The folder is made. What a killed process has left behind is
-    found by ``leftovers``.
+    So a file is whole or as it was. What a killed process has left behind is found by
+    ``leftovers``.
 
     Raises:
-        DataError: the file cannot be written.
+        DataError: the file cannot be written, or the block has raised OSError.
     """
     beside = path.with_name(f".{path.stem}.{uuid.uuid4().hex}{_PART}{path.suffix}")
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
         yield beside
         beside.replace(path)
     except OSError as error:
@@ -51,6 +50,7 @@ def write_json(path: Path, document: Mapping[str, Any]) -> None:
     """
     text = json.dumps(document, indent=2, allow_nan=False) + "\n"
     with replacing(path) as beside:
+        path.parent.mkdir(parents=True, exist_ok=True)
         beside.write_text(text, encoding="utf-8")
 
 

@@ -52,6 +52,7 @@ def write_ply(path: Path, splats: Splats) -> None:
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(table)}"]
     header += [f"property float {name}" for name in names] + ["end_header", ""]
     with replacing(path) as beside:
+        path.parent.mkdir(parents=True, exist_ok=True)
         beside.write_bytes("\n".join(header).encode("ascii") + table.tobytes())
 
 
