@@ -13,7 +13,7 @@ from numba import float32, prange
 from gsdmsr_cli.kernels import simd
 from gsdmsr_cli.kernels.jit import inline, parallel
 
-STRIP = 16
+STRIP = 32
 """Rows that one task handles at a time; its horizontal sums stay in cache."""
 
 _LANES = simd.LANES
@@ -23,6 +23,7 @@ _C1, _C2 = float32(0.01**2), float32(0.03**2)
 _MARGIN = _LANES
 _WINDOW = np.exp(-0.5 * (np.arange(_TAPS) - _REACH) ** 2 / 1.5**2)
 WINDOW = (_WINDOW / _WINDOW.sum()).astype(np.float32)
+_W0, _W1, _W2, _W3, _W4, _W5 = (float32(w) for w in WINDOW[: _REACH + 1])
 _SCALE = float32(1 / 255)
 
 
@@ -74,10 +75,18 @@ def _inside(x, width):
 
 
 @inline
-def _copy_row(flat, at, width, row):
-    """Copy ``width`` columns to ``row`` behind its margin, which stays 0."""
-    for x in range(width):
-        row[_MARGIN + x] = flat[at + x]
+def _blur(flat, at, step):
+    """Return the windowed mean of 16 values from ``at`` on and their neighbours, ``step`` apart.
+
+    Written out, the constants become part of the code, and mirrored taps share a product.
+    """
+    centre = simd.load(flat, at) * _W5
+    one = (simd.load(flat, at - step) + simd.load(flat, at + step)) * _W4
+    two = (simd.load(flat, at - 2 * step) + simd.load(flat, at + 2 * step)) * _W3
+    three = (simd.load(flat, at - 3 * step) + simd.load(flat, at + 3 * step)) * _W2
+    four = (simd.load(flat, at - 4 * step) + simd.load(flat, at + 4 * step)) * _W1
+    five = (simd.load(flat, at - 5 * step) + simd.load(flat, at + 5 * step)) * _W0
+    return (centre + one) + (two + three) + (four + five)
 
 
 @parallel
@@ -91,53 +100,45 @@ def ssim_maps(drawn, target, height, width, maps, sums):
     rows, stride = drawn.shape[1], drawn.shape[2]
     strips = (height + STRIP - 1) // STRIP
     x_flat, y_flat, out = drawn.reshape(-1), target.reshape(-1), maps.reshape(-1)
-    size = 3 * rows * stride
+    size, pitch = 3 * rows * stride, stride + 2 * _MARGIN
     for task in prange(3 * strips):
         channel, top = task // strips, task % strips * STRIP
         bottom = min(top + STRIP, height)
-        x_row = np.zeros(stride + 2 * _MARGIN, np.float32)
-        y_row = np.zeros(stride + 2 * _MARGIN, np.float32)
+        # one row of x, y, x x + y y and x y with a margin of zeros; only the sum of the squares
+        # matters, since the variances enter SSIM as a sum
+        row = np.zeros(4 * pitch, np.float32)
         layer = (STRIP + 2 * _REACH) * stride
-        across = np.zeros(5 * layer, np.float32)
-        zero, two = simd.splat(float32(0)), float32(2)
+        across = np.zeros(4 * layer, np.float32)
+        zero, one, two = simd.splat(float32(0)), simd.splat(float32(1)), float32(2)
         for y in range(max(top - _REACH, 0), min(bottom + _REACH, height)):
             at = (channel * rows + y) * stride
-            _copy_row(x_flat, at, width, x_row)
-            _copy_row(y_flat, at, width, y_row)
             for x in range(0, width, _LANES):
-                mx, my, mxx, myy, mxy = zero, zero, zero, zero, zero
-                for k in range(_TAPS):
-                    a = simd.load(x_row, x + _MARGIN - _REACH + k)
-                    b = simd.load(y_row, x + _MARGIN - _REACH + k)
-                    wa, wb = a * WINDOW[k], b * WINDOW[k]
-                    mx, my = mx + wa, my + wb
-                    mxx, myy, mxy = mxx + wa * a, myy + wb * b, mxy + wa * b
-                o = (y - top + _REACH) * stride + x
-                simd.store(across, o, mx)
-                simd.store(across, o + layer, my)
-                simd.store(across, o + 2 * layer, mxx)
-                simd.store(across, o + 3 * layer, myy)
-                simd.store(across, o + 4 * layer, mxy)
+                inside = _inside(x, width)
+                a, b = simd.load(x_flat, at + x) * inside, simd.load(y_flat, at + x) * inside
+                simd.store(row, _MARGIN + x, a)
+                simd.store(row, pitch + _MARGIN + x, b)
+                simd.store(row, 2 * pitch + _MARGIN + x, a * a + b * b)
+                simd.store(row, 3 * pitch + _MARGIN + x, a * b)
+            o = (y - top + _REACH) * stride
+            for x in range(0, width, _LANES):
+                for m in range(4):
+                    simd.store(across, m * layer + o + x, _blur(row, m * pitch + _MARGIN + x, 1))
         total = zero
         for y in range(top, bottom):
             for x in range(0, width, _LANES):
-                mx, my, mxx, myy, mxy = zero, zero, zero, zero, zero
-                for k in range(_TAPS):
-                    o = (y - top + k) * stride + x
-                    mx = mx + simd.load(across, o) * WINDOW[k]
-                    my = my + simd.load(across, o + layer) * WINDOW[k]
-                    mxx = mxx + simd.load(across, o + 2 * layer) * WINDOW[k]
-                    myy = myy + simd.load(across, o + 3 * layer) * WINDOW[k]
-                    mxy = mxy + simd.load(across, o + 4 * layer) * WINDOW[k]
+                o = (y - top + _REACH) * stride + x
+                mx, my = _blur(across, o, stride), _blur(across, o + layer, stride)
+                squares = _blur(across, o + 2 * layer, stride)
+                mxy = _blur(across, o + 3 * layer, stride)
                 cross, square = mx * my, mx * mx + my * my
                 c1, c2 = simd.splat(_C1), simd.splat(_C2)
-                luminance = (cross * two + c1) / (square + c1)
-                inverse = simd.splat(float32(1)) / (mxx + myy - square + c2)
+                inverse1, inverse = one / (square + c1), one / (squares - square + c2)
+                luminance = (cross * two + c1) * inverse1
                 structure = ((mxy - cross) * two + c2) * inverse
                 value = luminance * structure
                 by_xx = zero - value * inverse
                 by_xy = luminance * inverse * two
-                by_x = (my - mx * luminance) * structure * two / (square + c1)
+                by_x = (my - mx * luminance) * structure * two * inverse1
                 by_x = by_x - mx * by_xx * two - my * by_xy
                 inside = _inside(x, width)
                 total = total + value * inside
@@ -154,38 +155,28 @@ def ssim_gradient(drawn, target, height, width, maps, weight, gradient):
     rows, stride = drawn.shape[1], drawn.shape[2]
     strips = (height + STRIP - 1) // STRIP
     x_flat, y_flat, m_flat = drawn.reshape(-1), target.reshape(-1), maps.reshape(-1)
-    out, size = gradient.reshape(-1), 3 * rows * stride
+    out, size, pitch = gradient.reshape(-1), 3 * rows * stride, stride + 2 * _MARGIN
     for task in prange(3 * strips):
         channel, top = task // strips, task % strips * STRIP
         bottom = min(top + STRIP, height)
-        padded = np.zeros(3 * (stride + 2 * _MARGIN), np.float32)
-        pitch = stride + 2 * _MARGIN
+        row = np.zeros(3 * pitch, np.float32)
         layer = (STRIP + 2 * _REACH) * stride
         across = np.zeros(3 * layer, np.float32)
-        zero, two = simd.splat(float32(0)), float32(2)
+        two = float32(2)
         for y in range(max(top - _REACH, 0), min(bottom + _REACH, height)):
             at = (channel * rows + y) * stride
+            o = (y - top + _REACH) * stride
             for m in range(3):
-                _copy_row(m_flat, m * size + at, width, padded[m * pitch : (m + 1) * pitch])
-            for x in range(0, width, _LANES):
-                a, b, c = zero, zero, zero
-                for k in range(_TAPS):
-                    o = x + _MARGIN - _REACH + k
-                    a = a + simd.load(padded, o) * WINDOW[k]
-                    b = b + simd.load(padded, o + pitch) * WINDOW[k]
-                    c = c + simd.load(padded, o + 2 * pitch) * WINDOW[k]
-                o = (y - top + _REACH) * stride + x
-                simd.store(across, o, a)
-                simd.store(across, o + layer, b)
-                simd.store(across, o + 2 * layer, c)
+                # the maps are 0 beyond the picture's width, as far as they were written
+                for x in range(0, width, _LANES):
+                    simd.store(row, m * pitch + _MARGIN + x, simd.load(m_flat, m * size + at + x))
+                for x in range(0, width, _LANES):
+                    simd.store(across, m * layer + o + x, _blur(row, m * pitch + _MARGIN + x, 1))
         for y in range(top, bottom):
             for x in range(0, width, _LANES):
-                a, b, c = zero, zero, zero
-                for k in range(_TAPS):
-                    o = (y - top + k) * stride + x
-                    a = a + simd.load(across, o) * WINDOW[k]
-                    b = b + simd.load(across, o + layer) * WINDOW[k]
-                    c = c + simd.load(across, o + 2 * layer) * WINDOW[k]
+                o = (y - top + _REACH) * stride + x
+                a, b = _blur(across, o, stride), _blur(across, o + layer, stride)
+                c = _blur(across, o + 2 * layer, stride)
                 o = (channel * rows + y) * stride + x
                 d = a + simd.load(x_flat, o) * b * two + simd.load(y_flat, o) * c
                 d = d * weight * _inside(x, width)
