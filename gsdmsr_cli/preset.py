@@ -144,12 +144,15 @@ class LossOptions:
 
     Attributes:
         ssim: weight w of (1 - w) L1 + w (1 - SSIM), 0 to 1.
+        ssim_until: progress up to which the SSIM term counts; later w is 0.
     """
 
-    ssim: float = 0.0
+    ssim: float = 0.2
+    ssim_until: float = 0.3
 
     def __post_init__(self) -> None:
         require(self, "ssim", 0.0 <= self.ssim <= 1.0, "a weight from 0 to 1")
+        _require_progress(self, "ssim_until")
 
 
 @dataclass(frozen=True)
@@ -199,7 +202,7 @@ class DensityOptions:
     every: int = 100
     start: int = 300
     until: float = 0.35
-    gradient: float = 5e-4
+    gradient: float = 8e-4
     split_scale: float = 0.01
     prune_scale: float = 0.1
     prune_opacity: float = 0.005

@@ -211,6 +211,8 @@ def test_a_malformed_override_is_refused(override: str) -> None:
         "training.seed=-1",
         "training.threads=-1",
         "losses.ssim=1.5",
+        "losses.ssim_until=-0.1",
+        "training.average_from=1.5",
         "optimizer.means=[1e-3, 0]",
         "optimizer.network=[1e-3]",
         "density.every=0",

@@ -139,7 +139,9 @@ class Trainer:
         time = view.time if self._moving else None
         degree = self._sh_degree(progress)
         frame = draw(self.model, camera, time, self.engine, self.background, degree)
-        loss = photometric_loss(frame.rgb, pictures.load(view), self.preset.losses.ssim)
+        losses = self.preset.losses
+        ssim_weight = losses.ssim if progress < losses.ssim_until else 0.0
+        loss = photometric_loss(frame.rgb, pictures.load(view), ssim_weight)
         wanted = [*tensors.values(), frame.means2d]
         *gradients, on_screen = torch.autograd.grad(loss, wanted, allow_unused=True)
         return _Look(loss.item(), gradients, on_screen, (camera.width, camera.height))

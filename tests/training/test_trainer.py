@@ -125,7 +125,7 @@ def test_the_seed_decides(tiny_scene: Path, uninterrupted: Any) -> None:
 @every_motion
 def test_training_does_not_depend_on_the_number_of_threads(tiny_scene: Path, motion: str) -> None:
     def train() -> Sequence[Tensor]:
-        trainer = trainer_of(tiny_scene, preset_of("losses.ssim=0.2", motion=motion))
+        trainer = trainer_of(tiny_scene, preset_of("losses.ssim_until=0.5", motion=motion))
         after(trainer, STEPS)
         return list(state_of(trainer).values())
 
@@ -203,6 +203,18 @@ def test_pictures_are_small_at_first_where_asked_for(tiny_scene: Path) -> None:
     preset = preset_of("training.low_resolution_until=0.5", "data.downscale=2")
     after(trainer_of(tiny_scene, preset, witness), STEPS)
     assert witness.sizes == [(12, 12)] * (STEPS // 2) + [(24, 24)] * (STEPS // 2)
+
+
+def test_ssim_counts_up_to_its_end(tiny_scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    weights, true = [], trainer_module.photometric_loss
+
+    def remember(rgb: Tensor, target: Tensor, ssim_weight: float) -> Tensor:
+        weights.append(ssim_weight)
+        return true(rgb, target, ssim_weight)
+
+    monkeypatch.setattr(trainer_module, "photometric_loss", remember)
+    after(trainer_of(tiny_scene, preset_of("losses.ssim=0.4", "losses.ssim_until=0.25")), STEPS)
+    assert weights == [0.4] * (STEPS // 4) + [0.0] * (STEPS - STEPS // 4)
 
 
 def test_higher_degrees_of_colour_join_later(tiny_scene: Path) -> None:
