@@ -147,7 +147,7 @@ class LossOptions:
         ssim_until: progress up to which the SSIM term counts; later w is 0.
     """
 
-    ssim: float = 0.2
+    ssim: float = 0.0
     ssim_until: float = 0.3
 
     def __post_init__(self) -> None:
@@ -202,7 +202,7 @@ class DensityOptions:
     every: int = 100
     start: int = 300
     until: float = 0.35
-    gradient: float = 8e-4
+    gradient: float = 7e-4
     split_scale: float = 0.01
     prune_scale: float = 0.1
     prune_opacity: float = 0.005

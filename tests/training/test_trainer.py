@@ -125,7 +125,9 @@ def test_the_seed_decides(tiny_scene: Path, uninterrupted: Any) -> None:
 @every_motion
 def test_training_does_not_depend_on_the_number_of_threads(tiny_scene: Path, motion: str) -> None:
     def train() -> Sequence[Tensor]:
-        trainer = trainer_of(tiny_scene, preset_of("losses.ssim_until=0.5", motion=motion))
+        trainer = trainer_of(
+            tiny_scene, preset_of("losses.ssim=0.2", "losses.ssim_until=0.5", motion=motion)
+        )
         after(trainer, STEPS)
         return list(state_of(trainer).values())
 
