@@ -8,6 +8,8 @@ number of threads.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numba import float32, prange
 
@@ -18,12 +20,24 @@ _BLOCKS = 32
 
 _CHUNK = 64
 _LANES = simd.LANES
-_tile_4x4 = simd.make_product_tile(4, 4)
-_tile_8x2 = simd.make_product_tile(8, 2)
-_tile_8x1 = simd.make_product_tile(8, 1)
-_tile_1x4 = simd.make_product_tile(1, 4)
-_tile_1x2 = simd.make_product_tile(1, 2)
-_tile_1x1 = simd.make_product_tile(1, 1)
+
+
+def _make_strip(height: int, vectors: int) -> Any:
+    """Make the product of all rows, ``height`` at a time, with so many vectors of columns."""
+    many, one = simd.make_product_tile(height, vectors), simd.make_product_tile(1, vectors)
+
+    @inline
+    def strip(a, a0, a_row, a_step, rows, b, b0, b_step, count, c, c0, c_row):
+        whole = rows // height * height
+        for r in range(0, whole, height):
+            many(a, a0 + r * a_row, a_row, a_step, b, b0, b_step, count, c, c0 + r * c_row, c_row)
+        for r in range(whole, rows):
+            one(a, a0 + r * a_row, a_row, a_step, b, b0, b_step, count, c, c0 + r * c_row, c_row)
+
+    return strip
+
+
+_strip_of_4, _strip_of_2, _strip_of_1 = _make_strip(4, 4), _make_strip(8, 2), _make_strip(8, 1)
 
 
 @serial
@@ -35,96 +49,13 @@ def _add_product(a, a0, a_row, a_step, rows, b, b0, b_step, count, c, c0, c_row,
     """
     j = 0
     while columns - j >= 4 * _LANES:
-        whole = rows // 4 * 4
-        for r in range(0, whole, 4):
-            _tile_4x4(
-                a,
-                a0 + r * a_row,
-                a_row,
-                a_step,
-                b,
-                b0 + j,
-                b_step,
-                count,
-                c,
-                c0 + r * c_row + j,
-                c_row,
-            )
-        for r in range(whole, rows):
-            _tile_1x4(
-                a,
-                a0 + r * a_row,
-                a_row,
-                a_step,
-                b,
-                b0 + j,
-                b_step,
-                count,
-                c,
-                c0 + r * c_row + j,
-                c_row,
-            )
+        _strip_of_4(a, a0, a_row, a_step, rows, b, b0 + j, b_step, count, c, c0 + j, c_row)
         j += 4 * _LANES
-    whole = rows // 8 * 8
     while columns - j >= 2 * _LANES:
-        for r in range(0, whole, 8):
-            _tile_8x2(
-                a,
-                a0 + r * a_row,
-                a_row,
-                a_step,
-                b,
-                b0 + j,
-                b_step,
-                count,
-                c,
-                c0 + r * c_row + j,
-                c_row,
-            )
-        for r in range(whole, rows):
-            _tile_1x2(
-                a,
-                a0 + r * a_row,
-                a_row,
-                a_step,
-                b,
-                b0 + j,
-                b_step,
-                count,
-                c,
-                c0 + r * c_row + j,
-                c_row,
-            )
+        _strip_of_2(a, a0, a_row, a_step, rows, b, b0 + j, b_step, count, c, c0 + j, c_row)
         j += 2 * _LANES
     if columns > j:
-        for r in range(0, whole, 8):
-            _tile_8x1(
-                a,
-                a0 + r * a_row,
-                a_row,
-                a_step,
-                b,
-                b0 + j,
-                b_step,
-                count,
-                c,
-                c0 + r * c_row + j,
-                c_row,
-            )
-        for r in range(whole, rows):
-            _tile_1x1(
-                a,
-                a0 + r * a_row,
-                a_row,
-                a_step,
-                b,
-                b0 + j,
-                b_step,
-                count,
-                c,
-                c0 + r * c_row + j,
-                c_row,
-            )
+        _strip_of_1(a, a0, a_row, a_step, rows, b, b0 + j, b_step, count, c, c0 + j, c_row)
 
 
 @inline
