@@ -22,13 +22,19 @@ def cpu_name() -> str:
     return next(names, platform.processor() or platform.machine())
 
 
-def peak_rss_mib() -> float | None:
-    """Return the most memory this process has held so far [MiB], or None where nobody counts."""
+def peak_rss_mib(helpers: int = 0) -> float | None:
+    """Return the most memory this process has held so far [MiB], or None where nobody counts.
+
+    Each of the helper processes that have ended counts like the largest of them; what they share
+    with this process is counted again.
+    """
     if sys.platform == "win32":
         return None
     import resource
 
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    if helpers:
+        peak += helpers * resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss
     return peak / (1024 * 1024 if sys.platform == "darwin" else 1024)
 
 

@@ -41,6 +41,13 @@ class Model:
         named = {STORED_AS + name: tensor for name, tensor in self.splats.tensors().items()}
         return named | {MOVED_BY + name: t for name, t in self.motion.tensors().items()}
 
+    def per_splat(self) -> list[str]:
+        """Return the names of all tensors with one row per splat."""
+        own = self.splats.tensors()
+        return [STORED_AS + name for name in own] + [
+            MOVED_BY + name for name, group in self.motion.groups().items() if group in own
+        ]
+
 
 def load_model(
     tensors: Mapping[str, Tensor], settings: Mapping[str, Any], facts: Facts, progress: float

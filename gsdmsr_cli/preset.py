@@ -121,7 +121,7 @@ class TrainingOptions:
     steps: int = 10000
     budget: str | None = None
     static_until: float = 0.04
-    views_per_step: int = 1
+    views_per_step: int = 2
     low_resolution_until: float = 0.3
     average_from: float = 0.9
     checkpoint_minutes: float = 2.0

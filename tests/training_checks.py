@@ -17,7 +17,7 @@ from gsdmsr_cli.training.trainer import Trainer
 STEPS = 40
 
 OPTIONS = (
-    f"training.steps={STEPS}", "training.static_until=0.1",
+    f"training.steps={STEPS}", "training.static_until=0.1", "training.views_per_step=1",
     "splats.count=120", "splats.start=box", "splats.sh_start=0.5",
     "density.start=6", "density.every=6", "density.until=0.8", "density.gradient=1e-7",
     "density.cap=200", "density.reset_at=[0.4]",

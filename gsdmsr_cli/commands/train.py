@@ -18,7 +18,7 @@ from gsdmsr_cli.commands._training_display import TrainingDisplay
 from gsdmsr_cli.errors import UsageError
 from gsdmsr_cli.files import write_json
 from gsdmsr_cli.formats import read_scene
-from gsdmsr_cli.kernels.jit import set_threads
+from gsdmsr_cli.kernels.jit import set_threads, threads
 from gsdmsr_cli.motion import motion_options
 from gsdmsr_cli.pictures import Pictures
 from gsdmsr_cli.preset import BACKGROUNDS, Preset, load_preset
@@ -66,36 +66,50 @@ def run(
     scene, load_s = _timed(lambda: read_scene(data))
     if earlier is not None:
         earlier.check_scene(scene)
-    trainer, timings = _prepare(scene, options, where)
-    timings["load_s"] += load_s
-    if earlier is None:
-        name = preset or (config.name if config else "default")
-        folder = create_run(out, name, options, trainer.facts, scene, overwrite)
-        folder.save(trainer.checkpoint())  # a disk without room is told of now, not at the end
-    else:
-        trainer.restore(checkpoint)
-        folder = continue_run(earlier, options, scene)
-        folder.rewind_log(trainer.clock.step)
-    with TrainingDisplay() as display:
-        finished = train(trainer, folder, display.show)
-    _write_account(folder, trainer, where, timings)
+    trainer, prepare_s = _timed(lambda: _prepare(scene, options, where))
+    timings = {"load_s": load_s + prepare_s}
+    with trainer:
+        if earlier is None:
+            name = preset or (config.name if config else "default")
+            folder = create_run(out, name, options, trainer.facts, scene, overwrite)
+            folder.save(trainer.checkpoint())  # a disk without room is told of now, not at the end
+        else:
+            trainer.restore(checkpoint)
+            folder = continue_run(earlier, options, scene)
+            folder.rewind_log(trainer.clock.step)
+        timings["compile_s"] = _start_work(trainer, where)
+        processes = len(trainer.team)
+        with TrainingDisplay() as display:
+            finished = train(trainer, folder, display.show)
+    _write_account(folder, trainer, where, timings, processes)
     _say_end(folder, trainer, data, finished)
     if not finished:
         raise KeyboardInterrupt
 
 
-def _prepare(scene: Scene, options: Preset, device: str) -> tuple[Trainer, dict[str, float]]:
-    """Return a training ready for its first step, and how long that took."""
+def _prepare(scene: Scene, options: Preset, device: str) -> Trainer:
+    """Return a training that has read its pictures."""
     set_threads(options.training.threads)
     torch.set_num_threads(1)  # what torch itself computes in a step is too little to share
-    engine = raster.best_engine(device)
     pictures = Pictures(
         BACKGROUNDS[options.data.background], options.data.downscale, options.data.cache_mib << 20
     )
-    _, load_s = _timed(lambda: _preload(pictures, scene))
-    trainer, start_s = _timed(lambda: Trainer(scene, options, engine, pictures))
-    compile_s = warm_up(scene, options, engine)
-    return trainer, {"load_s": load_s + start_s, "compile_s": compile_s}
+    _preload(pictures, scene)
+    return Trainer(scene, options, raster.best_engine(device), pictures)
+
+
+def _start_work(trainer: Trainer, device: str) -> float:
+    """Make all processes of a training ready for its first step; return how long that took [s]."""
+
+    def prepare() -> float:
+        return warm_up(trainer.scene, trainer.preset, trainer.observer.engine)
+
+    started = time.perf_counter()
+    if device == "cpu":
+        trainer.hire(prepare)
+    prepare()
+    trainer.team.wait()
+    return time.perf_counter() - started
 
 
 def _preload(pictures: Pictures, scene: Scene) -> None:
@@ -144,7 +158,9 @@ def _require_rest(earlier: Run, options: Preset, checkpoint: Checkpoint) -> None
         )
 
 
-def _write_account(folder: Run, trainer: Trainer, device: str, timings: dict[str, float]) -> None:
+def _write_account(
+    folder: Run, trainer: Trainer, device: str, timings: dict[str, float], processes: int
+) -> None:
     """Write what the training took, the budget's share and what lies outside it."""
     clock = trainer.clock
     account = {
@@ -154,10 +170,11 @@ def _write_account(folder: Run, trainer: Trainer, device: str, timings: dict[str
         "steps": clock.step,
         "progress": clock.progress,
         "splats": len(trainer.model.splats),
-        "peak_rss_mib": machine.peak_rss_mib(),
+        "peak_rss_mib": machine.peak_rss_mib(processes - 1),
         "device": device,
         "processor": machine.cpu_name(),
-        "threads": torch.get_num_threads(),
+        "threads": threads(),
+        "processes": processes,
         "versions": machine.versions(),
     }
     write_json(folder.training_path, account)

@@ -105,3 +105,8 @@ def set_threads(count: int) -> int:
 def threads() -> int:
     """Return the number of threads kernels use."""
     return int(numba.get_num_threads())
+
+
+def may_fork() -> bool:
+    """Tell whether kernels run in a forked process when they have threads in this one."""
+    return str(numba.threading_layer()) in ("tbb", "workqueue")

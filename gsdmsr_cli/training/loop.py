@@ -155,9 +155,10 @@ class _Watch:
 
     @torch.no_grad()
     def _psnr(self) -> float | None:
-        trainer, view = self.trainer, self.view
-        camera, target = trainer.pictures.camera(view), trainer.pictures.load(view)
-        frame = draw(trainer.result(), camera, view.time, trainer.engine, trainer.background)
+        observer, view = self.trainer.observer, self.view
+        camera, target = observer.pictures.camera(view), observer.pictures.load(view)
+        model = self.trainer.result()
+        frame = draw(model, camera, view.time, observer.engine, observer.background)
         value = psnr(quantize(frame.rgb), target.permute(1, 2, 0) / 255)
         return None if math.isnan(value) else min(value, PSNR_CAP)
 

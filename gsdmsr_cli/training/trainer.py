@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from statistics import fmean
 
@@ -13,18 +13,18 @@ from torch import Tensor
 from gsdmsr_cli.errors import GsdmsrError
 from gsdmsr_cli.model import MOVED_BY, STORED_AS, Model, load_model
 from gsdmsr_cli.motion import Facts, start_motion
-from gsdmsr_cli.pictures import HalvedPictures, Pictures
-from gsdmsr_cli.preset import BACKGROUNDS, Preset
+from gsdmsr_cli.pictures import Pictures
+from gsdmsr_cli.preset import Preset
 from gsdmsr_cli.raster import Engine
 from gsdmsr_cli.run import Checkpoint
 from gsdmsr_cli.scene import Scene, View
-from gsdmsr_cli.splatting import draw
 from gsdmsr_cli.training import averaging
 from gsdmsr_cli.training.density import DensityStatistics, grow_and_prune, reset_opacities
 from gsdmsr_cli.training.initial import initial_splats
-from gsdmsr_cli.training.losses import photometric_loss
+from gsdmsr_cli.training.look import Observer
 from gsdmsr_cli.training.optimizer import Adam
 from gsdmsr_cli.training.schedule import log_linear, new_clock
+from gsdmsr_cli.training.team import Team
 
 PENALTY_EVERY = 4
 """Regularisers are slow to change and cost a pass over all planes: every 4th step, 4 times."""
@@ -46,40 +46,26 @@ class Step:
     loss: float
 
 
-@dataclass(frozen=True, eq=False)
-class _Look:
-    """What one view has to say.
-
-    Attributes:
-        loss: of the view.
-        gradients: of the loss by every tensor of the model, None where it has no part.
-        on_screen: (N, 2) by the positions on the screen [1 / px].
-        size: width and height of the picture [px].
-    """
-
-    loss: float
-    gradients: Sequence[Tensor | None]
-    on_screen: Tensor
-    size: tuple[int, int]
-
-
 class Trainer:
-    """A model in training on the train views of a scene.
+    """A model in training on the train views of a scene; a context that ends its helpers.
 
     Attributes:
         model: what is trained.
         clock: steps, time and progress.
+        observer: how views are looked at.
+        team: who looks at them; this process alone until ``hire``.
     """
 
     def __init__(self, scene: Scene, preset: Preset, engine: Engine, pictures: Pictures) -> None:
-        self.scene, self.preset, self.engine, self.pictures = scene, preset, engine, pictures
-        self.small_pictures = HalvedPictures(pictures)
+        self.scene, self.preset = scene, preset
         self.views = scene.split("train")
+        self.observer = Observer(preset, engine, pictures)
+        self.team = Team(self.observer, self.views)
         self.radius = scene.radius
         self.generator = torch.Generator().manual_seed(preset.training.seed)
         self.facts = facts_of(scene)
-        self.background = torch.tensor(BACKGROUNDS[preset.data.background])
-        splats = initial_splats(scene, preset.splats, pictures, self.background, self.generator)
+        background = self.observer.background
+        splats = initial_splats(scene, preset.splats, pictures, background, self.generator)
         motion = start_motion(preset.motion, self.facts, len(splats), self.generator)
         self.model = Model(splats, motion)
         self.optimizer = Adam()
@@ -91,18 +77,29 @@ class Trainer:
         self._moving = False
         self._skipped = 0
 
+    def __enter__(self) -> Trainer:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.team.dismiss()
+
+    def hire(self, prepare: Callable[[], object]) -> None:
+        """Get helpers for a step's views, until the context ends; see ``Team.hire``."""
+        capacity = max(self.preset.density.cap, len(self.model.splats))
+        self.team.hire(self.model, capacity, self.preset.training.views_per_step, prepare)
+
     def step(self) -> Step:
         """Choose views, look at each, add up their gradients, learn, grow and prune."""
         progress = self.clock.progress
         self._enter_phase(progress)
-        views = [self._next_view() for _ in range(self.preset.training.views_per_step)]
+        rows = [self._next_row() for _ in range(self.preset.training.views_per_step)]
         tensors = self.model.tensors()
-        looks = [self._look(view, tensors, progress) for view in views]
+        looks = self.team.look(self.model, rows, progress, self._moving)
         value = fmean(look.loss for look in looks)
         gradients = [look.gradients for look in looks]
         weights = [1 / len(looks)] * len(looks)
         if self._moving and self.clock.step % PENALTY_EVERY == 0:
-            penalty, further = self._penalise(tensors, views[0])
+            penalty, further = self._penalise(tensors, self.views[rows[0]])
             value += PENALTY_EVERY * penalty
             gradients, weights = [*gradients, further], [*weights, PENALTY_EVERY]
         for tensor, *parts in zip(tensors.values(), *gradients, strict=True):
@@ -111,8 +108,9 @@ class Trainer:
         if not math.isfinite(value):
             return self._skip()
         self._skipped = 0
-        for look in looks:
-            self.statistics.observe(look.on_screen, *look.size)
+        if progress < self.preset.density.until:
+            for look in looks:
+                self.statistics.observe(look.on_screen, *look.size)
         self.optimizer.step(tensors, self._rates(progress))
         self._control_density(progress)
         if self.clock.step % averaging.EVERY == 0:
@@ -131,21 +129,6 @@ class Trainer:
             return self.model
         return load_model(self.average.tensors, self.preset.motion, self.facts, self.clock.progress)
 
-    def _look(self, view: View, tensors: Mapping[str, Tensor], progress: float) -> _Look:
-        """Draw a view, compare it, and take the gradients."""
-        low = progress < self.preset.training.low_resolution_until
-        pictures = self.small_pictures if low else self.pictures
-        camera = pictures.camera(view)
-        time = view.time if self._moving else None
-        degree = self._sh_degree(progress)
-        frame = draw(self.model, camera, time, self.engine, self.background, degree)
-        losses = self.preset.losses
-        ssim_weight = losses.ssim if progress < losses.ssim_until else 0.0
-        loss = photometric_loss(frame.rgb, pictures.load(view), ssim_weight)
-        wanted = [*tensors.values(), frame.means2d]
-        *gradients, on_screen = torch.autograd.grad(loss, wanted, allow_unused=True)
-        return _Look(loss.item(), gradients, on_screen, (camera.width, camera.height))
-
     def _penalise(
         self, tensors: Mapping[str, Tensor], view: View
     ) -> tuple[float, Sequence[Tensor | None]]:
@@ -156,18 +139,11 @@ class Trainer:
         gradients = torch.autograd.grad(penalty, list(tensors.values()), allow_unused=True)
         return penalty.item(), gradients
 
-    def _next_view(self) -> View:
+    def _next_row(self) -> int:
         """Return the next view of a random order that visits every view before any again."""
         if not self._queue:
             self._queue = torch.randperm(len(self.views), generator=self.generator).tolist()
-        return self.views[self._queue.pop()]
-
-    def _sh_degree(self, progress: float) -> int:
-        """Return the degree of colour; degree d joins at d times ``sh_start``."""
-        options = self.preset.splats
-        if options.sh_start <= 0:
-            return options.sh_degree
-        return min(options.sh_degree, int(progress / options.sh_start))
+        return self._queue.pop()
 
     def _enter_phase(self, progress: float) -> None:
         """Start the motion after the static phase, without the momentum of what did not move."""
@@ -191,13 +167,6 @@ class Trainer:
         moving = self.model.motion.groups()
         return rates | {MOVED_BY + name: groups[group] for name, group in moving.items()}
 
-    def _per_splat(self) -> list[str]:
-        """Return the names of all tensors with one row per splat."""
-        moving = self.model.motion.groups()
-        return [STORED_AS + name for name in _PER_SPLAT] + [
-            MOVED_BY + name for name, group in moving.items() if group in _PER_SPLAT
-        ]
-
     def _control_density(self, progress: float) -> None:
         options, step = self.preset.density, self.clock.step
         growing = progress < options.until
@@ -214,7 +183,7 @@ class Trainer:
             with torch.no_grad():
                 for name, tensor in self.model.splats.tensors().items():
                     tensor.copy_(getattr(grown, name))
-            names = self._per_splat()
+            names = self.model.per_splat()
             self.optimizer.take(names, rows, fresh)
             self.average.take(names, rows)
             if fresh.any():

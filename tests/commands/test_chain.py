@@ -130,7 +130,8 @@ def test_training_writes_a_run_with_log_and_account(run: Path) -> None:
     assert (account["steps"], account["progress"]) == (STEPS, 1.0)
     assert 0 < account["train_s"] < 120 and account["load_s"] > 0 and account["compile_s"] > 0
     assert 400 < account["splats"] == log[-1]["splats"] <= 600
-    assert account["device"] == "cpu" and account["threads"] >= 1
+    assert account["device"] == "cpu" and account["threads"] == numba.config.NUMBA_NUM_THREADS
+    assert 1 <= account["processes"] <= min(2, account["threads"])
     opened = open_run(run)
     assert (opened.name, opened.preset.training.steps) == ("dnerf", STEPS)
     assert (opened.preset.splats.count, opened.preset.training.seed) == (400, 3)

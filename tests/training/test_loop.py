@@ -138,9 +138,11 @@ def test_the_psnr_is_of_the_middle_view_of_val(trainer: Trainer, run: Run) -> No
     view = trainer.scene.split("val")[1]
     assert watched_view(trainer.scene) is view
     with torch.no_grad():
-        camera = trainer.pictures.camera(view)
-        frame = draw(trainer.model, camera, view.time, trainer.engine, trainer.background)
-    true = trainer.pictures.load(view).permute(1, 2, 0) / 255
+        camera = trainer.observer.pictures.camera(view)
+        frame = draw(
+            trainer.model, camera, view.time, trainer.observer.engine, trainer.observer.background
+        )
+    true = trainer.observer.pictures.load(view).permute(1, 2, 0) / 255
     assert told[-1].psnr == pytest.approx(psnr(quantize(frame.rgb), true))
     assert told[-1].psnr != told[0].psnr
 
@@ -156,7 +158,7 @@ def test_without_val_a_train_view_is_watched(trainer: Trainer, run: Run) -> None
 def test_a_model_that_is_not_a_number_has_no_psnr(trainer: Trainer, run: Run) -> None:
     def step() -> Step:
         trainer.clock.step += 1
-        trainer.background = torch.full((3,), math.nan)
+        trainer.observer.background = torch.full((3,), math.nan)
         return Step(1.0)
 
     trainer.step = step  # type: ignore[method-assign]

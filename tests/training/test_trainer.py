@@ -26,7 +26,7 @@ from gsdmsr_cli.errors import GsdmsrError
 from gsdmsr_cli.frame import Frame
 from gsdmsr_cli.raster import best_engine
 from gsdmsr_cli.splats import Splats
-from gsdmsr_cli.training import trainer as trainer_module
+from gsdmsr_cli.training import look
 from gsdmsr_cli.training.trainer import PATIENCE, Trainer
 
 every_motion = pytest.mark.parametrize("motion", plugins.names(motions.__name__))
@@ -178,13 +178,13 @@ def test_the_motion_starts_without_the_momentum_of_the_static_phase(tiny_scene: 
 def test_every_view_is_seen_before_any_again(tiny_scene: Path) -> None:
     preset = preset_of("training.low_resolution_until=0")
     trainer, seen = trainer_of(tiny_scene, preset), []
-    load = trainer.pictures.load
+    load = trainer.observer.pictures.load
 
     def remember(view: Any) -> Tensor:
         seen.append(view.name)
         return load(view)
 
-    trainer.pictures.load = remember  # type: ignore[method-assign]
+    trainer.observer.pictures.load = remember  # type: ignore[method-assign]
     after(trainer, 36)
     rounds = [seen[i : i + 12] for i in (0, 12, 24)]
     for names in rounds:
@@ -208,13 +208,13 @@ def test_pictures_are_small_at_first_where_asked_for(tiny_scene: Path) -> None:
 
 
 def test_ssim_counts_up_to_its_end(tiny_scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    weights, true = [], trainer_module.photometric_loss
+    weights, true = [], look.photometric_loss
 
     def remember(rgb: Tensor, target: Tensor, ssim_weight: float) -> Tensor:
         weights.append(ssim_weight)
         return true(rgb, target, ssim_weight)
 
-    monkeypatch.setattr(trainer_module, "photometric_loss", remember)
+    monkeypatch.setattr(look, "photometric_loss", remember)
     after(trainer_of(tiny_scene, preset_of("losses.ssim=0.4", "losses.ssim_until=0.25")), STEPS)
     assert weights == [0.4] * (STEPS // 4) + [0.0] * (STEPS - STEPS // 4)
 
@@ -250,8 +250,8 @@ class Losses:
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.factor = 1.0
-        self.true = trainer_module.photometric_loss
-        monkeypatch.setattr(trainer_module, "photometric_loss", self)
+        self.true = look.photometric_loss
+        monkeypatch.setattr(look, "photometric_loss", self)
 
     def __call__(self, *arguments: Any) -> Tensor:
         return self.true(*arguments) * self.factor
