@@ -147,7 +147,7 @@ class LossOptions:
         ssim_until: progress up to which the SSIM term counts; later w is 0.
     """
 
-    ssim: float = 0.0
+    ssim: float = 0.2
     ssim_until: float = 0.3
 
     def __post_init__(self) -> None:

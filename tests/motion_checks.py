@@ -10,7 +10,7 @@ from kernel_checks import generator
 from gsdmsr_cli.motion import Facts, Motion, start_motion
 from gsdmsr_cli.splats import Splats
 
-FACTS = Facts(bound=1.3, frames=20)
+FACTS = Facts(bound=1.3, box=((-1.3, -1.2, -1.1), (1.3, 1.4, 1.0)), frames=20)
 
 
 def splats_of(count: int, seed: int = 0) -> Splats:

@@ -19,6 +19,7 @@ from kernel_checks import generator
 from gsdmsr_cli import formats, plugins
 from gsdmsr_cli import motion as motions
 from gsdmsr_cli.errors import DataError, UsageError
+from gsdmsr_cli.fields.planes import CUBE
 from gsdmsr_cli.formats import dnerf, read_scene
 from gsdmsr_cli.model import Model, load_model
 from gsdmsr_cli.motion import Facts, start_motion
@@ -71,7 +72,7 @@ def splats_of(count: int) -> Splats:
 
 
 def started(settings: dict[str, Any], count: int) -> Any:
-    return start_motion(settings, Facts(1.3, 10), count, generator())
+    return start_motion(settings, Facts(1.3, CUBE, 10), count, generator())
 
 
 def test_the_example_of_a_motion_keeps_to_the_rules(linear: ModuleType) -> None:
@@ -95,7 +96,7 @@ def test_the_example_of_a_motion_is_saved_and_loaded(linear: ModuleType) -> None
         model.tensors()["motion.velocities"].normal_(generator=generator())
     model.take(torch.tensor([1, 1, 3]))
     tensors = {name: tensor.detach().clone() for name, tensor in model.tensors().items()}
-    loaded = load_model(tensors, {"name": "linear"}, Facts(1.3, 10), 1.0)
+    loaded = load_model(tensors, {"name": "linear"}, Facts(1.3, CUBE, 10), 1.0)
     assert torch.equal(loaded.at(0.2).means, model.at(0.2).means)
 
 

@@ -23,7 +23,7 @@ from gsdmsr_cli.run import Checkpoint, Run, continue_run, create_run, open_run, 
 from gsdmsr_cli.scene import Scene
 from gsdmsr_cli.splats import Splats
 
-FACTS = Facts(bound=1.3, frames=12)
+FACTS = Facts(bound=1.3, box=((-1.0, -1.1, -1.2), (1.3, 1.2, 1.1)), frames=12)
 NOTHING = np.zeros((0, 3), np.float32)
 
 

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from gsdmsr_cli.benchmark.cloud import camera, cloud
+from gsdmsr_cli.fields.planes import CUBE
 from gsdmsr_cli.model import Model
 from gsdmsr_cli.motion import Facts, start_motion
 from gsdmsr_cli.raster import best_engine
@@ -45,7 +46,7 @@ def drawing(size: int, count: int) -> Callable[[], None]:
 
 def training_step(size: int, count: int, motion: str) -> Callable[[], None]:
     """Return a function that makes a training step at rate 0: L1 + SSIM, one view."""
-    moving = start_motion({"name": motion}, Facts(1.0, FRAMES), count, _generator())
+    moving = start_motion({"name": motion}, Facts(1.0, CUBE, FRAMES), count, _generator())
     model = Model(cloud(count), moving)
     model.motion.advance(1.0)
     engine, view, background = best_engine("cpu"), camera(size), torch.ones(3)

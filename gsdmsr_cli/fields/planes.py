@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 from torch.autograd import Function
 from torch.autograd.function import once_differentiable
@@ -16,6 +17,12 @@ from gsdmsr_cli.kernels.simd import LANES
 from gsdmsr_cli.tensors import array, has_kernels
 
 _SPACE_AXES = ((0, 1), (0, 2), (1, 2))
+
+Corner = tuple[float, float, float]
+Box = tuple[Corner, Corner]
+"""Lower and upper corner [world units], the upper one above the lower along every axis."""
+
+CUBE: Box = ((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
 
 
 class Level(NamedTuple):
@@ -54,23 +61,30 @@ def new_level(resolution: int, times: int, channels: int, generator: torch.Gener
     return Level(space * 0.4 + 0.1, torch.ones(3, chunks, times, resolution, LANES))
 
 
-def lookup(levels: Sequence[Level], points: Tensor, time: float, bound: float = 1.0) -> Tensor:
-    """Return the features (N, sum of channels) of points (N, 3) in [-bound, bound]^3.
+def lookup(levels: Sequence[Level], points: Tensor, time: float, box: Box = CUBE) -> Tensor:
+    """Return the features (N, sum of channels) of points (N, 3) in the box that the grid fills.
 
     Each level gives the product of six samples; levels are concatenated. The time is in [-1, 1].
     Coordinates outside are clamped to the border and pass no gradient.
     """
     tensors = [tensor for level in levels for tensor in level]
     if has_kernels(points, *tensors):
-        features: Tensor = _Lookup.apply(points.contiguous(), time, bound, *tensors)
+        features: Tensor = _Lookup.apply(points.contiguous(), time, box, *tensors)
         return features
-    return lookup_twin(levels, points, time, bound)
+    return lookup_twin(levels, points, time, box)
 
 
-def lookup_twin(levels: Sequence[Level], points: Tensor, time: float, bound: float = 1.0) -> Tensor:
+def lookup_twin(levels: Sequence[Level], points: Tensor, time: float, box: Box = CUBE) -> Tensor:
     """Return what ``lookup`` does, in plain torch, for any device and dtype."""
-    places, when = points * (1 / bound), points.new_tensor(time)
+    scale, shift = points.new_tensor(_to_cube(box))
+    places, when = points * scale + shift, points.new_tensor(time)
     return torch.cat([_sample_level(level, places, when) for level in levels], dim=1)
+
+
+def _to_cube(box: Box) -> NDArray[np.float64]:
+    """Return what to multiply by and what to add, (2, 3), to take the box to [-1, 1]^3."""
+    lower, upper = np.array(box)
+    return np.stack([2 / (upper - lower), -(upper + lower) / (upper - lower)])
 
 
 def _cell(x: Tensor, size: int) -> tuple[Tensor, Tensor]:
@@ -101,11 +115,11 @@ class _Lookup(Function):
     """All levels at one time, written side by side into one array of features."""
 
     @staticmethod
-    def forward(ctx: Any, points: Tensor, time: float, bound: float, *tensors: Tensor) -> Tensor:
+    def forward(ctx: Any, points: Tensor, time: float, box: Box, *tensors: Tensor) -> Tensor:
         spaces, times = (tuple(map(array, part)) for part in (tensors[::2], tensors[1::2]))
         lines = tuple(np.empty(plane.shape[:2] + plane.shape[3:], np.float32) for plane in times)
         features = torch.empty(len(points), sum(plane.shape[1] * LANES for plane in spaces))
-        where = array(points), np.float32(1 / bound), time
+        where = array(points), _to_cube(box).astype(np.float32), time
         kernels.lookup(*where, spaces, times, lines, array(features))
         ctx.where, ctx.spaces, ctx.lines = where, spaces, lines
         ctx.save_for_backward(points, *tensors)

@@ -75,11 +75,18 @@ def _linear(flat, at, w):
     return low + (simd.load(flat, at + _LANES) - low) * w
 
 
+@inline
+def _in_box(points, box, i, axis):
+    """Return a coordinate of a point where the box reaches from -1 to 1."""
+    return points[i, axis] * box[0, axis] + box[1, axis]
+
+
 @parallel
-def lookup(points, scale, time, spaces, times, lines, features):
-    """Write the (N, C) features of (N, 3) points, which ``scale`` takes to [-1, 1].
+def lookup(points, box, time, spaces, times, lines, features):
+    """Write the (N, C) features of (N, 3) points.
 
     Args:
+        points: positions; times ``box[0]`` plus ``box[1]`` (2, 3) they lie in [-1, 1].
         spaces, times: the planes, one array per level.
         lines: one array (3, chunks, R, 16) per level, out: the temporal planes at ``time``.
         features: out, the levels side by side.
@@ -97,9 +104,9 @@ def lookup(points, scale, time, spaces, times, lines, features):
             planes, strips = space.reshape(-1), lines[level].reshape(-1)
             row, plane, strip = size * _LANES, size * size * _LANES, size * _LANES
             for i in range(n * block // _BLOCKS, n * (block + 1) // _BLOCKS):
-                ix, wx = cell(points[i, 0] * scale, size)
-                iy, wy = cell(points[i, 1] * scale, size)
-                iz, wz = cell(points[i, 2] * scale, size)
+                ix, wx = cell(_in_box(points, box, i, 0), size)
+                iy, wy = cell(_in_box(points, box, i, 1), size)
+                iz, wz = cell(_in_box(points, box, i, 2), size)
                 x_at, y_at, z_at = ix * _LANES, iy * _LANES, iz * _LANES
                 for c in range(chunks):
                     xy, xz, yz = c * plane, (chunks + c) * plane, (2 * chunks + c) * plane
@@ -144,7 +151,7 @@ def _scatter_bilinear(flat, at, row, wx, wy, d):
 
 @parallel
 def lookup_backward(
-    points, scale, time, spaces, lines, d_features, d_spaces, d_times, d_lines, shares, d_points
+    points, box, time, spaces, lines, d_features, d_spaces, d_times, d_lines, shares, d_points
 ):
     """Write the gradients of the planes and, if wanted, of the points.
 
@@ -152,7 +159,7 @@ def lookup_backward(
     the sums do not depend on their number. Points outside [-1, 1] get no gradient along that axis.
 
     Args:
-        points, scale, time, spaces, lines: see ``lookup``.
+        points, box, time, spaces, lines: see ``lookup``.
         d_features: (N, C) of all levels side by side.
         d_spaces, d_times: out, one array per level.
         d_lines: room for the gradients of ``lines``.
@@ -171,14 +178,19 @@ def lookup_backward(
         planes, strips = space.reshape(-1), lines[level].reshape(-1)
         d_planes, d_strips = d_space.reshape(-1), d_line.reshape(-1)
         row, plane, strip = size * _LANES, size * size * _LANES, size * _LANES
-        cells = _HALF * float32(size - 1) * scale
+        cells = _HALF * float32(size - 1)
         for axis in range(3):
             d_space[axis, c] = float32(0)
             d_line[axis, c] = float32(0)
         for i in range(n):
-            ix, wx = cell(points[i, 0] * scale, size)
-            iy, wy = cell(points[i, 1] * scale, size)
-            iz, wz = cell(points[i, 2] * scale, size)
+            px, py, pz = (
+                _in_box(points, box, i, 0),
+                _in_box(points, box, i, 1),
+                _in_box(points, box, i, 2),
+            )
+            ix, wx = cell(px, size)
+            iy, wy = cell(py, size)
+            iz, wz = cell(pz, size)
             xy = c * plane + iy * row + ix * _LANES
             xz = (chunks + c) * plane + iz * row + ix * _LANES
             yz = (2 * chunks + c) * plane + iz * row + iy * _LANES
@@ -205,9 +217,9 @@ def lookup_backward(
                 gx = gx + hx + d_x * (simd.load(strips, x + _LANES) - simd.load(strips, x))
                 gy = gy + hy + d_y * (simd.load(strips, y + _LANES) - simd.load(strips, y))
                 gz = gz + hz + d_z * (simd.load(strips, z + _LANES) - simd.load(strips, z))
-                shares[task, i, 0] = _inside(points[i, 0] * scale) * cells * simd.reduce_sum(gx)
-                shares[task, i, 1] = _inside(points[i, 1] * scale) * cells * simd.reduce_sum(gy)
-                shares[task, i, 2] = _inside(points[i, 2] * scale) * cells * simd.reduce_sum(gz)
+                shares[task, i, 0] = _inside(px) * cells * box[0, 0] * simd.reduce_sum(gx)
+                shares[task, i, 1] = _inside(py) * cells * box[0, 1] * simd.reduce_sum(gy)
+                shares[task, i, 2] = _inside(pz) * cells * box[0, 2] * simd.reduce_sum(gz)
             _scatter_bilinear(d_planes, xy, row, wx, wy, d_xy)
             _scatter_bilinear(d_planes, xz, row, wx, wz, d_xz)
             _scatter_bilinear(d_planes, yz, row, wy, wz, d_yz)

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from gsdmsr_cli import plugins, strict
+from gsdmsr_cli.fields.planes import Box
 from gsdmsr_cli.splats import Splats
 
 
@@ -23,11 +24,13 @@ class Facts:
     """What a motion may know of its scene; saved with every run.
 
     Attributes:
-        bound: half edge of the box around the origin that holds the scene [world units].
+        bound: half edge of the cube around the origin that holds the scene [world units].
+        box: lower and upper corner of where the canonical splats are [world units].
         frames: number of distinct train times.
     """
 
     bound: float
+    box: Box
     frames: int
 
 

@@ -40,7 +40,7 @@ class HexPlaneMotion:
     """x, q and log s plus offsets read from one grid of several levels (4D-GS, section 4)."""
 
     def __init__(self, options: Options, facts: Facts, generator: torch.Generator) -> None:
-        self.options, self.bound = options, facts.bound
+        self.options, self.facts = options, facts
         times = time_nodes(facts.frames, options.time_ratio)
         self.levels = [
             trained(planes.new_level(resolution, times, options.channels, generator))
@@ -53,7 +53,7 @@ class HexPlaneMotion:
     def at(self, splats: Splats, time: float) -> Splats:
         """Return the deformed splats; time is mapped to the whole grid, [-1, 1]."""
         points = splats.means.detach() if self.options.detach else splats.means
-        features = planes.lookup(self.levels, points, 2 * time - 1, self.bound)
+        features = planes.lookup(self.levels, points, 2 * time - 1, self.facts.box)
         return displace(splats, network.apply_network(self.layers, features))
 
     def take(self, rows: Tensor) -> None:

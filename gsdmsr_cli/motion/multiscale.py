@@ -37,11 +37,11 @@ class Options:
         space_smoothness, time_smoothness, time_stillness: weights of the plane regularisers.
     """
 
-    coarse_level: int = 32
+    coarse_level: int = 16
     coarse_channels: int = 16
     coarse_time_ratio: float = 0.125
     coarse_until: float = 0.06
-    levels: tuple[int, ...] = (32, 64)
+    levels: tuple[int, ...] = (16, 32)
     channels: int = 16
     time_ratio: float = 0.2
     width: int = 32
@@ -57,7 +57,7 @@ class MultiscaleMotion:
     """x + coarse + fine offset, q + fine offset, log s + fine offset (the method's section 3)."""
 
     def __init__(self, options: Options, facts: Facts, generator: torch.Generator) -> None:
-        self.options, self.bound = options, facts.bound
+        self.options, self.facts = options, facts
         self.fine_active = False
         coarse_times = time_nodes(facts.frames, options.coarse_time_ratio)
         self.coarse = [
@@ -98,7 +98,7 @@ class MultiscaleMotion:
 
     def _features(self, levels: list[planes.Level], splats: Splats, time: float) -> Tensor:
         points = splats.means.detach() if self.options.detach else splats.means
-        return planes.lookup(levels, points, 2 * time - 1, self.bound)
+        return planes.lookup(levels, points, 2 * time - 1, self.facts.box)
 
     def take(self, rows: Tensor) -> None:
         """Hold nothing per splat."""
@@ -114,7 +114,7 @@ class MultiscaleMotion:
         value = planes.penalty(levels, o.space_smoothness, o.time_smoothness, o.time_stillness)
         if o.offset_weight > 0:
             features = self._features(self.coarse, splats, time)
-            offset = network.apply_network(self.coarse_decoder, features) / self.bound
+            offset = network.apply_network(self.coarse_decoder, features) / self.facts.bound
             value = value + o.offset_weight * offset.square().sum(dim=1).mean()
         return value
 

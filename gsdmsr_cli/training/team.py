@@ -16,7 +16,7 @@ import multiprocessing
 import signal
 import sys
 import traceback
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
@@ -70,7 +70,7 @@ class Team:
         self.observer, self.views = observer, views
         self._helpers: list[_Helper] = []
         self._published: _Shelf
-        self._threads = jit.threads()
+        self._threads = 0
 
     def __len__(self) -> int:
         return 1 + len(self._helpers)
@@ -118,19 +118,31 @@ class Team:
         shares = [rows[i :: len(self)] for i in range(len(self))]
         busy = [pair for pair in zip(self._helpers, shares[1:], strict=True) if pair[1]]
         if busy:
-            self._published.write(model.tensors())
+            self._published.hold(model)
         for helper, share in busy:
             helper.send(_Task(len(model.splats), share, progress, moving))
         own = [self.observer.look(model, self.views[row], progress, moving) for row in shares[0]]
         looks = [own] + [helper.looks(model) for helper, _ in busy]
         return [looks[i % len(self)][i // len(self)] for i in range(len(rows))]
 
+    @contextlib.contextmanager
+    def all_threads(self) -> Iterator[None]:
+        """Use the helpers' threads as well, while they have nothing to do."""
+        own = jit.threads()
+        if self._helpers:
+            jit.set_threads(self._threads)
+        try:
+            yield
+        finally:
+            jit.set_threads(own)
+
     def dismiss(self) -> None:
         """Let the helpers go, and give their threads back to this process."""
+        if self._helpers:
+            jit.set_threads(self._threads)
         for helper in self._helpers:
             helper.end()
         self._helpers = []
-        jit.set_threads(self._threads)
 
 
 class _Helper:
@@ -224,8 +236,7 @@ class _Desk:
         model = self._model
         if len(model.splats) != task.splats or not self._reads_published:
             model.take(torch.zeros(task.splats, dtype=torch.int64))  # for the shapes alone
-            for name, tensor in model.tensors().items():
-                tensor.data = self.published.tensor(name, tensor.shape)
+            self.published.lend(model)
             self._reads_published = True
         model.motion.advance(task.progress)
         return [
@@ -288,6 +299,19 @@ class _Shelf:
         """Return the place of the named tensor."""
         start = self._starts[name]
         return self._memory[start : start + math.prod(shape)].view(*shape)
+
+    def hold(self, model: Model) -> None:
+        """Move the model's tensors to their places, if they are elsewhere."""
+        for name, tensor in model.tensors().items():
+            place = self.tensor(name, tensor.shape)
+            if tensor.data_ptr() != place.data_ptr():
+                place.copy_(tensor.detach())
+                tensor.data = place
+
+    def lend(self, model: Model) -> None:
+        """Let the model's tensors be those that lie here."""
+        for name, tensor in model.tensors().items():
+            tensor.data = self.tensor(name, tensor.shape)
 
     @torch.no_grad()
     def write(self, tensors: Mapping[str, Tensor]) -> None:

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from gsdmsr_cli.errors import GsdmsrError
+from gsdmsr_cli.fields.planes import Box, Corner
 from gsdmsr_cli.model import MOVED_BY, STORED_AS, Model, load_model
 from gsdmsr_cli.motion import Facts, start_motion
 from gsdmsr_cli.pictures import Pictures
@@ -18,6 +19,7 @@ from gsdmsr_cli.preset import Preset
 from gsdmsr_cli.raster import Engine
 from gsdmsr_cli.run import Checkpoint
 from gsdmsr_cli.scene import Scene, View
+from gsdmsr_cli.splats import Splats
 from gsdmsr_cli.training import averaging
 from gsdmsr_cli.training.density import DensityStatistics, grow_and_prune, reset_opacities
 from gsdmsr_cli.training.initial import initial_splats
@@ -31,6 +33,10 @@ PENALTY_EVERY = 4
 
 PRUNE_EVERY = 500
 """Interval of pruning alone, once growing has ended [steps]."""
+
+STRAYS, MARGIN = 0.01, 0.075
+"""Share of the first splats that may lie beyond each side of the motion's box, and what is added
+to the box on each side, in units of its edge."""
 
 PATIENCE = 20
 """Consecutive steps without a finite loss after which training gives up."""
@@ -63,9 +69,9 @@ class Trainer:
         self.team = Team(self.observer, self.views)
         self.radius = scene.radius
         self.generator = torch.Generator().manual_seed(preset.training.seed)
-        self.facts = facts_of(scene)
         background = self.observer.background
         splats = initial_splats(scene, preset.splats, pictures, background, self.generator)
+        self.facts = facts_of(scene, splats)
         motion = start_motion(preset.motion, self.facts, len(splats), self.generator)
         self.model = Model(splats, motion)
         self.optimizer = Adam()
@@ -97,13 +103,13 @@ class Trainer:
         looks = self.team.look(self.model, rows, progress, self._moving)
         value = fmean(look.loss for look in looks)
         gradients = [look.gradients for look in looks]
-        weights = [1 / len(looks)] * len(looks)
         if self._moving and self.clock.step % PENALTY_EVERY == 0:
             penalty, further = self._penalise(tensors, self.views[rows[0]])
             value += PENALTY_EVERY * penalty
-            gradients, weights = [*gradients, further], [*weights, PENALTY_EVERY]
+            weight = PENALTY_EVERY * len(looks)
+            gradients.append([None if part is None else part * weight for part in further])
         for tensor, *parts in zip(tensors.values(), *gradients, strict=True):
-            tensor.grad = _sum(parts, weights)
+            tensor.grad = _sum(parts)
         self.clock.step += 1
         if not math.isfinite(value):
             return self._skip()
@@ -111,7 +117,8 @@ class Trainer:
         if progress < self.preset.density.until:
             for look in looks:
                 self.statistics.observe(look.on_screen, *look.size)
-        self.optimizer.step(tensors, self._rates(progress))
+        with self.team.all_threads():
+            self.optimizer.step(tensors, self._rates(progress))
         self._control_density(progress)
         if self.clock.step % averaging.EVERY == 0:
             self._average(progress)
@@ -254,19 +261,36 @@ class Trainer:
         self.clock.step, self.clock.before = checkpoint.step, checkpoint.elapsed
 
 
-def facts_of(scene: Scene) -> Facts:
-    """Return what a motion may know of the scene."""
-    return Facts(bound=scene.bound, frames=len(scene.train_times))
+def facts_of(scene: Scene, splats: Splats) -> Facts:
+    """Return what a motion may know of the scene, which ``splats`` are about to represent."""
+    return Facts(scene.bound, _box(splats.means, scene.bound), len(scene.train_times))
 
 
-def _sum(parts: Sequence[Tensor | None], weights: Sequence[float]) -> Tensor | None:
-    """Return the weighted sum of the parts that are there, in this order, or None."""
+def _box(means: Tensor, bound: float) -> Box:
+    """Return the box that holds all but the outermost of the means, and some more.
+
+    4D-GS's code gives its grid the box of the first cloud as well. Random starts have strays,
+    hence the quantiles; what ends up outside moves like the border.
+    """
+    means = means.double()
+    lower, upper = means.quantile(STRAYS, 0), means.quantile(1 - STRAYS, 0)
+    half = ((upper - lower) * (0.5 + MARGIN)).clamp(min=0.01 * bound)
+    centre = (lower + upper) / 2
+    return _corner(centre - half), _corner(centre + half)
+
+
+def _corner(point: Tensor) -> Corner:
+    x, y, z = point.tolist()
+    return x, y, z
+
+
+def _sum(parts: Sequence[Tensor | None]) -> Tensor | None:
+    """Return the sum of the parts that are there, in this order, or None.
+
+    Adam does not care whether it gets the sum or the mean over a step's views.
+    """
     total: Tensor | None = None
-    for part, weight in zip(parts, weights, strict=True):
-        if part is None:
-            continue
-        if total is None:
-            total = part if weight == 1 else part * weight
-        else:
-            total = torch.add(total, part, alpha=weight)
+    for part in parts:
+        if part is not None:
+            total = part if total is None else total + part
     return total

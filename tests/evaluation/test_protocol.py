@@ -17,6 +17,7 @@ from gsdmsr_cli.errors import DataError
 from gsdmsr_cli.evaluation import protocol
 from gsdmsr_cli.evaluation.lpips import NETS, Lpips, Missing
 from gsdmsr_cli.evaluation.protocol import Studio, average, load_nets, score, score_views, storage
+from gsdmsr_cli.fields.planes import CUBE
 from gsdmsr_cli.model import Model
 from gsdmsr_cli.motion import Facts, start_motion
 from gsdmsr_cli.pictures import Pictures
@@ -119,7 +120,7 @@ def studio() -> Studio:
         logit_opacities=torch.zeros(1),
         sh=torch.zeros(1, 1, 3),
     )
-    motion = start_motion({"name": "static"}, Facts(1.0, 2), 1, torch.Generator())
+    motion = start_motion({"name": "static"}, Facts(1.0, CUBE, 2), 1, torch.Generator())
     pictures = Pictures(BACKGROUND, 2, 10**6)
     engine, background = load_engine("reference"), torch.tensor(BACKGROUND)
     return Studio(Model(splats, motion), engine, pictures, background)

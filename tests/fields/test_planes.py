@@ -103,6 +103,27 @@ def test_lookup_matches_the_twin(shapes: Sizes, count: int, time: float, seed: i
 
 
 @pytest.mark.parametrize("look", [planes.lookup, planes.lookup_twin])
+def test_a_box_is_stretched_to_the_cube(look: Any) -> None:
+    lower, upper = torch.tensor([-3.0, 0.5, 1.0]), torch.tensor([-1.0, 0.6, 9.0])
+    tensors = tensors_of([(5, 4, 16), (3, 2, 16)])
+    found, true = leaves(tensors, torch.float32), leaves(tensors, torch.float32)
+    inside = points_of(30).requires_grad_()
+    points = (lower + (inside.detach() + 1) / 2 * (upper - lower)).requires_grad_()
+    box = ((-3.0, 0.5, 1.0), (-1.0, 0.6, 9.0))
+    features, expected = (
+        look(levels_of(found), points, 0.3, box),
+        look(levels_of(true), inside, 0.3),
+    )
+    assert_near(features, expected, 1e-4, "features")
+    features.square().sum().backward()
+    expected.square().sum().backward()
+    assert points.grad is not None and inside.grad is not None
+    assert_near(points.grad * (upper - lower) / 2, inside.grad, 1e-3, "gradient of the points")
+    for a, b in zip(found, true, strict=True):
+        assert_near(a.grad, b.grad, 1e-3, "gradient")
+
+
+@pytest.mark.parametrize("look", [planes.lookup, planes.lookup_twin])
 def test_no_points_have_no_features_and_give_no_gradient(look: Any) -> None:
     tensors = leaves(tensors_of([(3, 4, 16), (5, 2, 32)]), torch.float32)
     features = look(levels_of(tensors), torch.zeros(0, 3), 0.2)

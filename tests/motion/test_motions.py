@@ -17,6 +17,7 @@ from torch import Tensor
 from gsdmsr_cli import motion as motions
 from gsdmsr_cli import plugins
 from gsdmsr_cli.errors import UsageError
+from gsdmsr_cli.fields.planes import CUBE
 from gsdmsr_cli.motion import Motion, start_motion
 from gsdmsr_cli.preset import OptimizerOptions
 from gsdmsr_cli.splats import Splats
@@ -234,6 +235,6 @@ def test_multiscale_without_the_pyramid_gives_the_decoder_fewer_inputs() -> None
 
 @pytest.mark.parametrize(("frames", "nodes"), [(2, 8), (100, 25), (150, 38)])
 def test_the_time_grid_follows_from_the_frames(frames: int, nodes: int) -> None:
-    facts = motions.Facts(bound=1.0, frames=frames)
+    facts = motions.Facts(1.0, CUBE, frames)
     motion = start_motion({"name": "hexplane"}, facts, 1, generator())
     assert motion.tensors()["grid.0.time"].shape[2] == nodes

@@ -27,6 +27,7 @@ from gsdmsr_cli.frame import Frame
 from gsdmsr_cli.raster import best_engine
 from gsdmsr_cli.splats import Splats
 from gsdmsr_cli.training import look
+from gsdmsr_cli.training import trainer as trainer_module
 from gsdmsr_cli.training.trainer import PATIENCE, Trainer
 
 every_motion = pytest.mark.parametrize("motion", plugins.names(motions.__name__))
@@ -173,6 +174,19 @@ def test_the_motion_starts_without_the_momentum_of_the_static_phase(tiny_scene: 
     after(trainer, 3)
     # the second moments, which say how large a step may be, stay
     assert forgotten == [(f"splats.{name}", False) for name in SPLATS]
+
+
+def test_the_motion_is_told_where_the_first_splats_are(tiny_scene: Path) -> None:
+    trainer = trainer_of(tiny_scene, preset_of("splats.count=2000"))
+    lower, upper = torch.tensor(trainer.facts.box)
+    means = trainer.model.splats.means.detach()
+    outside = ((means < lower) | (means > upper)).float().mean(dim=0)
+    assert (outside < 0.02).all()  # the start is a cube of 2.6, whose strays are few
+    assert ((upper - lower) < 1.15 * 2.6).all()
+    # strays do not stretch the box
+    strays = torch.cat([means, torch.full((10, 3), 1e3)])
+    assert torch.tensor(trainer_module._box(strays, 1.3)).abs().max() < 1.5
+    assert torch.tensor(trainer_module._box(means[:1], 1.3)).diff(dim=0).min() > 0.02
 
 
 def test_every_view_is_seen_before_any_again(tiny_scene: Path) -> None:
