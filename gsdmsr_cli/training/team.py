@@ -20,6 +20,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
+from typing import TypeVar
 
 import torch
 from torch import Tensor
@@ -29,6 +30,8 @@ from gsdmsr_cli.kernels import jit
 from gsdmsr_cli.model import Model
 from gsdmsr_cli.scene import View
 from gsdmsr_cli.training.look import Look, Observer
+
+T = TypeVar("T")
 
 _ON_SCREEN = "on screen"
 
@@ -106,10 +109,18 @@ class Team:
         for helper in self._helpers:
             helper.wait()
 
-    def look(self, model: Model, rows: Sequence[int], progress: float, moving: bool) -> list[Look]:
+    def look(
+        self,
+        model: Model,
+        rows: Sequence[int],
+        progress: float,
+        moving: bool,
+        meanwhile: Callable[[], T],
+    ) -> tuple[list[Look], T]:
         """Look at the views of these rows, in this order.
 
-        The gradients are only good until the next call.
+        ``meanwhile`` is called when this process has looked and helpers may not have; what it
+        returns is returned as well. The gradients are only good until the next call.
 
         Raises:
             GsdmsrError: a helper has ended.
@@ -122,8 +133,9 @@ class Team:
         for helper, share in busy:
             helper.send(_Task(len(model.splats), share, progress, moving))
         own = [self.observer.look(model, self.views[row], progress, moving) for row in shares[0]]
+        other = meanwhile()
         looks = [own] + [helper.looks(model) for helper, _ in busy]
-        return [looks[i % len(self)][i // len(self)] for i in range(len(rows))]
+        return [looks[i % len(self)][i // len(self)] for i in range(len(rows))], other
 
     @contextlib.contextmanager
     def all_threads(self) -> Iterator[None]:

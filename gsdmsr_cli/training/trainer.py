@@ -100,14 +100,17 @@ class Trainer:
         self._enter_phase(progress)
         rows = [self._next_row() for _ in range(self.preset.training.views_per_step)]
         tensors = self.model.tensors()
-        looks = self.team.look(self.model, rows, progress, self._moving)
+        penalised = self._moving and self.clock.step % PENALTY_EVERY == 0
+        looks, penalty = self.team.look(
+            self.model, rows, progress, self._moving,
+            lambda: self._penalise(tensors, self.views[rows[0]]) if penalised else None,
+        )  # fmt: skip
         value = fmean(look.loss for look in looks)
         gradients = [look.gradients for look in looks]
-        if self._moving and self.clock.step % PENALTY_EVERY == 0:
-            penalty, further = self._penalise(tensors, self.views[rows[0]])
-            value += PENALTY_EVERY * penalty
+        if penalty is not None:
+            value += PENALTY_EVERY * penalty[0]
             weight = PENALTY_EVERY * len(looks)
-            gradients.append([None if part is None else part * weight for part in further])
+            gradients.append([None if part is None else part * weight for part in penalty[1]])
         for tensor, *parts in zip(tensors.values(), *gradients, strict=True):
             tensor.grad = _sum(parts)
         self.clock.step += 1
