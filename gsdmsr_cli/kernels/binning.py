@@ -21,6 +21,9 @@ from gsdmsr_cli.splatting_constants import ALPHA_MIN, TILE
 _ALPHA_MIN = float32(ALPHA_MIN)
 _ROUNDING = float32(ROUNDING)
 _HALF = float32(0.5)
+_BITS = 11
+_RADIX = 1 << _BITS
+_MASK = np.uint32(_RADIX - 1)
 
 
 class Bins(NamedTuple):
@@ -39,14 +42,48 @@ class Bins(NamedTuple):
     splats: NDArray[np.int32]
 
 
-def depth_order(depths: NDArray[np.float32], tiles: NDArray[np.int32]) -> NDArray[np.int32]:
+@serial
+def _sorted_rows(rows, keys):
+    """Return int32 rows by rising uint32 key, one key per row, ties in the order given.
+
+    A radix sort: three passes over 11 bits each.
+    """
+    n = rows.shape[0]
+    other_rows, other_keys = np.empty_like(rows), np.empty_like(keys)
+    heads = np.empty(_RADIX, np.int64)
+    for turn in range(3):
+        shift = np.uint32(_BITS * turn)
+        heads[:] = 0
+        for k in range(n):
+            heads[(keys[k] >> shift) & _MASK] += 1
+        total = 0
+        for digit in range(_RADIX):
+            count = heads[digit]
+            heads[digit] = total
+            total += count
+        for k in range(n):
+            digit = (keys[k] >> shift) & _MASK
+            at = heads[digit]
+            heads[digit] = at + 1
+            other_rows[at], other_keys[at] = rows[k], keys[k]
+        rows, other_rows = other_rows, rows
+        keys, other_keys = other_keys, keys
+    return rows
+
+
+@serial
+def depth_order(depths, tiles):
     """Return the rows with tiles > 0 by rising depth, ties by row; depths are positive there."""
-    rows = np.flatnonzero(tiles)
-    # the bits of a positive float sort like the float, so one integer carries depth and row
-    keys = depths[rows].view(np.uint32).astype(np.uint64) << np.uint64(32)
-    keys |= rows.astype(np.uint64)
-    keys.sort()
-    return keys.astype(np.uint32).view(np.int32)
+    count = 0
+    for i in range(tiles.shape[0]):
+        count += tiles[i] > 0
+    rows, keys = np.empty(count, np.int32), np.empty(count, np.uint32)
+    bits, at = depths.view(np.uint32), 0
+    for i in range(tiles.shape[0]):
+        if tiles[i] > 0:
+            rows[at], keys[at] = i, bits[i]  # the bits of a positive float sort like the float
+            at += 1
+    return _sorted_rows(rows, keys)
 
 
 @inline
@@ -136,22 +173,17 @@ def _scatter(pairs, order_size, chunks, bounds, listed, heads, entries):
             entries[at, 1] = ((code >> 4) & 15) | ((code & 15) << 8)
 
 
-def bin_splats(
-    means2d: NDArray[np.float32],
-    conics: NDArray[np.float32],
-    depths: NDArray[np.float32],
-    opacities: NDArray[np.float32],
-    tiles: NDArray[np.int32],
-    width: int,
-    height: int,
-) -> Bins:
-    """Sort N projected splats (see ``projection.project``) into tiles."""
+@serial
+def assign(means2d, conics, depths, opacities, tiles, width, height, chunks):
+    """Return what ``bin_splats`` does, as a plain tuple; ``chunks`` is the number of threads."""
     order = depth_order(depths, tiles)
-    n, chunks = len(order), threads()
+    n = order.shape[0]
     tile_count = ((width + TILE - 1) // TILE) * ((height + TILE - 1) // TILE)
-    bounds = np.zeros(n + 1, np.int64)
-    np.cumsum(tiles[order], out=bounds[1:])
-    pairs = np.empty((max(int(bounds[-1]), 1), 2), np.int32)
+    bounds = np.empty(n + 1, np.int64)
+    bounds[0] = 0
+    for k in range(n):
+        bounds[k + 1] = bounds[k] + tiles[order[k]]
+    pairs = np.empty((max(bounds[n], 1), 2), np.int32)
     counts = np.empty((chunks, tile_count), np.int32)
     listed = np.empty(chunks, np.int64)
     starts = np.empty(tile_count + 1, np.int32)
@@ -162,5 +194,20 @@ def bin_splats(
     total = _scan(counts, starts)
     entries = np.empty((total, 2), np.int32)
     _scatter(pairs, n, chunks, bounds, listed, counts, entries)
-    busiest = np.argsort(-np.diff(starts), kind="stable").astype(np.int32)
-    return Bins(entries, starts, busiest, order)
+    rows, fullness = np.empty(tile_count, np.int32), np.empty(tile_count, np.uint32)
+    for tile in range(tile_count):
+        rows[tile], fullness[tile] = tile, total - (starts[tile + 1] - starts[tile])
+    return entries, starts, _sorted_rows(rows, fullness), order
+
+
+def bin_splats(
+    means2d: NDArray[np.float32],
+    conics: NDArray[np.float32],
+    depths: NDArray[np.float32],
+    opacities: NDArray[np.float32],
+    tiles: NDArray[np.int32],
+    width: int,
+    height: int,
+) -> Bins:
+    """Sort N projected splats (see ``projection.project``) into tiles."""
+    return Bins(*assign(means2d, conics, depths, opacities, tiles, width, height, threads()))

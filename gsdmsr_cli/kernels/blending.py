@@ -31,6 +31,7 @@ _ALPHA_MIN = float32(ALPHA_MIN)
 _ALPHA_MAX = float32(ALPHA_MAX)
 _STOP = float32(TRANSMITTANCE_STOP)
 _HALF = float32(0.5)
+_SCALE = float32(1 / 255)
 _BLOCK = TILE * TILE
 
 
@@ -61,6 +62,105 @@ def _unfinished_rows(block, first, last):
     return first, last
 
 
+@inline
+def _corner(tile, columns):
+    """Return the tile's row and column, and the centre of its first pixel."""
+    tile_y, tile_x = tile // columns, tile % columns
+    return tile_y, tile_x, float32(tile_x * TILE) + _HALF, float32(tile_y * TILE) + _HALF
+
+
+@inline
+def _draw(block, records, entries, start, end, x0, y0):
+    """Blend a tile's entries into a block of transmittance, red, green and blue.
+
+    Returns the entry after the last one blended.
+    """
+    one, zero = simd.splat(float32(1)), simd.splat(float32(0))
+    cut, full, floor = simd.splat(_ALPHA_MIN), simd.splat(_ALPHA_MAX), simd.splat(float32(-126))
+    for y in range(TILE):
+        simd.store(block, y * TILE, one)
+        simd.store(block, _BLOCK + y * TILE, zero)
+        simd.store(block, 2 * _BLOCK + y * TILE, zero)
+        simd.store(block, 3 * _BLOCK + y * TILE, zero)
+    top, bottom = 0, TILE - 1
+    k = start
+    while k < end:
+        if ((k - start) & 15) == 0 and k > start:
+            top, bottom = _unfinished_rows(block, top, bottom)
+            if top > bottom:
+                break
+        i, rows = entries[k, 0], entries[k, 1]
+        k += 1
+        dx = simd.iota(x0 - records[i, 0])
+        at_row = dx * dx * records[i, 2] + simd.splat(records[i, 5])
+        slope, curve = dx * records[i, 3], records[i, 4]
+        red, green, blue = records[i, 6], records[i, 7], records[i, 8]
+        for y in range(max(rows & 255, top), min(rows >> 8, bottom) + 1):
+            dy = y0 + float32(y) - records[i, 1]
+            power = at_row + (slope + simd.splat(curve * dy)) * dy
+            alpha = simd.minimum(simd.exp2(simd.maximum(power, floor)), full)
+            alpha = simd.where_ge(alpha, cut, alpha)
+            o = y * TILE
+            before = simd.load(block, o)
+            weight = alpha * before
+            simd.store(block, o, before - weight)
+            o += _BLOCK
+            simd.store(block, o, simd.load(block, o) + weight * red)
+            o += _BLOCK
+            simd.store(block, o, simd.load(block, o) + weight * green)
+            o += _BLOCK
+            simd.store(block, o, simd.load(block, o) + weight * blue)
+    return k
+
+
+@inline
+def _differentiate(block, records, entries, start, end, x0, y0, own):
+    """Add a tile's shares of the gradients of its splats to ``own``.
+
+    The block holds the transmittance, 1 at first, what is left of d_rgb . rgb, and d_rgb.
+    """
+    one, zero = simd.splat(float32(1)), simd.splat(float32(0))
+    cut, full, floor = simd.splat(_ALPHA_MIN), simd.splat(_ALPHA_MAX), simd.splat(float32(-126))
+    top, bottom = 0, TILE - 1
+    for k in range(start, end):
+        if ((k - start) & 15) == 0 and k > start:
+            top, bottom = _unfinished_rows(block, top, bottom)
+        i, rows = entries[k, 0], entries[k, 1]
+        dx = simd.iota(x0 - records[i, 0])
+        at_row = dx * dx * records[i, 2] + simd.splat(records[i, 5])
+        slope, curve = dx * records[i, 3], records[i, 4]
+        red, green, blue = records[i, 6], records[i, 7], records[i, 8]
+        sum_e, sum_ey, sum_eyy = zero, zero, zero
+        sum_red, sum_green, sum_blue = zero, zero, zero
+        for y in range(max(rows & 255, top), min(rows >> 8, bottom) + 1):
+            dy = y0 + float32(y) - records[i, 1]
+            power = at_row + (slope + simd.splat(curve * dy)) * dy
+            free = simd.exp2(simd.maximum(power, floor))
+            alpha = simd.minimum(free, full)
+            alpha = simd.where_ge(alpha, cut, alpha)
+            o = y * TILE
+            before, left = simd.load(block, o), simd.load(block, _BLOCK + o)
+            d_red = simd.load(block, 2 * _BLOCK + o)
+            d_green = simd.load(block, 3 * _BLOCK + o)
+            d_blue = simd.load(block, 4 * _BLOCK + o)
+            weight = alpha * before
+            share = (d_red * red + d_green * green + d_blue * blue) * weight
+            left = left - share
+            simd.store(block, o, before - weight)
+            simd.store(block, _BLOCK + o, left)
+            e = simd.where_ge(full, free, share - alpha * left / (one - alpha))
+            ey = e * dy
+            sum_e, sum_ey, sum_eyy = sum_e + e, sum_ey + ey, sum_eyy + ey * dy
+            sum_red, sum_green = sum_red + weight * d_red, sum_green + weight * d_green
+            sum_blue = sum_blue + weight * d_blue
+        sum_ex = sum_e * dx
+        shares = simd.reduce_sums(
+            sum_e, sum_ex, sum_ey, sum_ex * dx, sum_ey * dx, sum_eyy,
+            sum_red, sum_green, sum_blue,
+        )  # fmt: skip
+        simd.store(own, i * RECORD, simd.load(own, i * RECORD) + shares)
+
+
 @parallel
 def blend(records, entries, starts, busiest, lanes, columns, background, rgb, alpha, ends):
     """Draw every tile.
@@ -80,47 +180,11 @@ def blend(records, entries, starts, busiest, lanes, columns, background, rgb, al
     pixels, cover = rgb.reshape(-1), alpha.reshape(-1)
     for lane in prange(lanes):
         block = np.empty(4 * _BLOCK, np.float32)
-        one, zero = simd.splat(float32(1)), simd.splat(float32(0))
-        cut, full, floor = simd.splat(_ALPHA_MIN), simd.splat(_ALPHA_MAX), simd.splat(float32(-126))
+        one = simd.splat(float32(1))
         for turn in range(lane, busiest.shape[0], lanes):
             tile = busiest[turn]
-            tile_y, tile_x = tile // columns, tile % columns
-            for y in range(TILE):
-                simd.store(block, y * TILE, one)
-                simd.store(block, _BLOCK + y * TILE, zero)
-                simd.store(block, 2 * _BLOCK + y * TILE, zero)
-                simd.store(block, 3 * _BLOCK + y * TILE, zero)
-            x0, y0 = float32(tile_x * TILE) + _HALF, float32(tile_y * TILE) + _HALF
-            start, end = starts[tile], starts[tile + 1]
-            top, bottom = 0, TILE - 1
-            k = start
-            while k < end:
-                if ((k - start) & 15) == 0 and k > start:
-                    top, bottom = _unfinished_rows(block, top, bottom)
-                    if top > bottom:
-                        break
-                i, rows = entries[k, 0], entries[k, 1]
-                k += 1
-                dx = simd.iota(x0 - records[i, 0])
-                at_row = dx * dx * records[i, 2] + simd.splat(records[i, 5])
-                slope, curve = dx * records[i, 3], records[i, 4]
-                red, green, blue = records[i, 6], records[i, 7], records[i, 8]
-                for y in range(max(rows & 255, top), min(rows >> 8, bottom) + 1):
-                    dy = y0 + float32(y) - records[i, 1]
-                    power = at_row + (slope + simd.splat(curve * dy)) * dy
-                    alpha = simd.minimum(simd.exp2(simd.maximum(power, floor)), full)
-                    alpha = simd.where_ge(alpha, cut, alpha)
-                    o = y * TILE
-                    before = simd.load(block, o)
-                    weight = alpha * before
-                    simd.store(block, o, before - weight)
-                    o += _BLOCK
-                    simd.store(block, o, simd.load(block, o) + weight * red)
-                    o += _BLOCK
-                    simd.store(block, o, simd.load(block, o) + weight * green)
-                    o += _BLOCK
-                    simd.store(block, o, simd.load(block, o) + weight * blue)
-            ends[tile] = k
+            tile_y, tile_x, x0, y0 = _corner(tile, columns)
+            ends[tile] = _draw(block, records, entries, starts[tile], starts[tile + 1], x0, y0)
             for y in range(TILE):
                 o = (tile_y * TILE + y) * stride + tile_x * TILE
                 left = simd.load(block, y * TILE)
@@ -153,11 +217,10 @@ def blend_backward(
         own = sums[part].reshape(-1)
         own[:] = float32(0)
         block = np.empty(5 * _BLOCK, np.float32)
-        one, zero = simd.splat(float32(1)), simd.splat(float32(0))
-        cut, full, floor = simd.splat(_ALPHA_MIN), simd.splat(_ALPHA_MAX), simd.splat(float32(-126))
+        one = simd.splat(float32(1))
         for turn in range(part, busiest.shape[0], PARTS):
             tile = busiest[turn]
-            tile_y, tile_x = tile // columns, tile % columns
+            tile_y, tile_x, x0, y0 = _corner(tile, columns)
             start, end = starts[tile], ends[tile]
             if start == end:
                 continue
@@ -177,45 +240,81 @@ def blend_backward(
                 simd.store(block, 2 * _BLOCK + y * TILE, d_red)
                 simd.store(block, 3 * _BLOCK + y * TILE, d_green)
                 simd.store(block, 4 * _BLOCK + y * TILE, d_blue)
-            x0, y0 = float32(tile_x * TILE) + _HALF, float32(tile_y * TILE) + _HALF
-            top, bottom = 0, TILE - 1
-            for k in range(start, end):
-                if ((k - start) & 15) == 0 and k > start:
-                    top, bottom = _unfinished_rows(block, top, bottom)
-                i, rows = entries[k, 0], entries[k, 1]
-                dx = simd.iota(x0 - records[i, 0])
-                at_row = dx * dx * records[i, 2] + simd.splat(records[i, 5])
-                slope, curve = dx * records[i, 3], records[i, 4]
-                red, green, blue = records[i, 6], records[i, 7], records[i, 8]
-                sum_e, sum_ey, sum_eyy = zero, zero, zero
-                sum_red, sum_green, sum_blue = zero, zero, zero
-                for y in range(max(rows & 255, top), min(rows >> 8, bottom) + 1):
-                    dy = y0 + float32(y) - records[i, 1]
-                    power = at_row + (slope + simd.splat(curve * dy)) * dy
-                    free = simd.exp2(simd.maximum(power, floor))
-                    alpha = simd.minimum(free, full)
-                    alpha = simd.where_ge(alpha, cut, alpha)
-                    o = y * TILE
-                    before, left = simd.load(block, o), simd.load(block, _BLOCK + o)
-                    d_red = simd.load(block, 2 * _BLOCK + o)
-                    d_green = simd.load(block, 3 * _BLOCK + o)
-                    d_blue = simd.load(block, 4 * _BLOCK + o)
-                    weight = alpha * before
-                    share = (d_red * red + d_green * green + d_blue * blue) * weight
-                    left = left - share
-                    simd.store(block, o, before - weight)
-                    simd.store(block, _BLOCK + o, left)
-                    e = simd.where_ge(full, free, share - alpha * left / (one - alpha))
-                    ey = e * dy
-                    sum_e, sum_ey, sum_eyy = sum_e + e, sum_ey + ey, sum_eyy + ey * dy
-                    sum_red, sum_green = sum_red + weight * d_red, sum_green + weight * d_green
-                    sum_blue = sum_blue + weight * d_blue
-                sum_ex = sum_e * dx
-                shares = simd.reduce_sums(
-                    sum_e, sum_ex, sum_ey, sum_ex * dx, sum_ey * dx, sum_eyy,
-                    sum_red, sum_green, sum_blue,
-                )  # fmt: skip
-                simd.store(own, i * RECORD, simd.load(own, i * RECORD) + shares)
+            _differentiate(block, records, entries, start, end, x0, y0, own)
+
+
+@inline
+def _compare_plain(target, background, top, left, bottom, right):
+    """Return the sum of |background - target| over a tile that no splat touches."""
+    total = float32(0)
+    for channel in range(3):
+        for y in range(top, bottom):
+            for x in range(left, right):
+                total += abs(background[channel] - float32(target[channel, y, x]) * _SCALE)
+    return total
+
+
+@inline
+def _compare(block, row, target, background, top, left, bottom, right, weight):
+    """Return the sum of |rgb - target| of a drawn tile, and prepare its block for gradients."""
+    total, one = float32(0), simd.splat(float32(1))
+    for y in range(TILE):
+        o, inside = y * TILE, right - left if top + y < bottom else 0
+        passed = simd.load(block, o)
+        rest = simd.splat(float32(0))
+        for channel in range(3):
+            shade = simd.load(block, (1 + channel) * _BLOCK + o) + passed * background[channel]
+            simd.store(row, channel * TILE, shade)
+        for channel in range(3):
+            shade = simd.load(row, channel * TILE)
+            for x in range(inside):
+                value = row[channel * TILE + x]
+                difference = value - float32(target[channel, top + y, left + x]) * _SCALE
+                total += abs(difference)
+                sign = float32(difference > 0) - float32(difference < 0)
+                row[channel * TILE + x] = weight * sign
+            for x in range(inside, TILE):
+                row[channel * TILE + x] = float32(0)
+            slope = simd.load(row, channel * TILE)
+            rest = rest + slope * shade
+            simd.store(block, (2 + channel) * _BLOCK + o, slope)
+        simd.store(block, o, one)
+        simd.store(block, _BLOCK + o, rest)
+    return total
+
+
+@parallel
+def blend_l1(records, entries, starts, busiest, columns, background, target, weight, losses, sums):
+    """Draw every tile, compare it with the target and take the gradients while it is at hand.
+
+    What ``blend``, ``photometric.l1`` and ``blend_backward`` do one after another, without a
+    picture in between.
+
+    Args:
+        target: (3, H, W) uint8.
+        weight: of each absolute difference in the loss.
+        losses: (tiles,) out, sums of absolute differences.
+        others: see ``blend`` and ``blend_backward``.
+    """
+    height, width = target.shape[1], target.shape[2]
+    for part in prange(PARTS):
+        own = sums[part].reshape(-1)
+        own[:] = float32(0)
+        block, row = np.empty(5 * _BLOCK, np.float32), np.empty(3 * TILE, np.float32)
+        for turn in range(part, busiest.shape[0], PARTS):
+            tile = busiest[turn]
+            tile_y, tile_x, x0, y0 = _corner(tile, columns)
+            top, left = tile_y * TILE, tile_x * TILE
+            bottom, right = min(top + TILE, height), min(left + TILE, width)
+            start, end = starts[tile], starts[tile + 1]
+            if start == end:
+                losses[tile] = _compare_plain(target, background, top, left, bottom, right)
+                continue
+            end = _draw(block, records, entries, start, end, x0, y0)
+            losses[tile] = _compare(
+                block, row, target, background, top, left, bottom, right, weight
+            )
+            _differentiate(block, records, entries, start, end, x0, y0, own)
 
 
 @parallel

@@ -11,7 +11,7 @@ import numpy as np
 from numba import float32, prange
 
 from gsdmsr_cli.kernels import simd
-from gsdmsr_cli.kernels.jit import inline, parallel
+from gsdmsr_cli.kernels.jit import inline, parallel, serial
 
 STRIP = 32
 """Rows that one task handles at a time; its horizontal sums stay in cache."""
@@ -181,3 +181,22 @@ def ssim_gradient(drawn, target, height, width, maps, weight, gradient):
                 d = a + simd.load(x_flat, o) * b * two + simd.load(y_flat, o) * c
                 d = d * weight * _inside(x, width)
                 simd.store(out, o, simd.load(out, o) + d)
+
+
+@serial
+def compare(drawn, target, height, width, ssim_weight, gradient):
+    """Return (1 - w) L1 + w (1 - SSIM), and write its gradient; arguments as in ``l1``."""
+    count = 3 * height * width
+    sums = np.empty(3 * drawn.shape[1])
+    l1(drawn, target, height, width, float32((1 - ssim_weight) / count), gradient, sums)
+    loss = (1 - ssim_weight) * sums.sum() / count
+    if ssim_weight > 0:
+        wanted = np.empty_like(drawn)
+        to_float(target, wanted)
+        maps = np.empty((3, 3, drawn.shape[1], drawn.shape[2]), np.float32)
+        shares = np.empty(3 * ((height + STRIP - 1) // STRIP))
+        ssim_maps(drawn, wanted, height, width, maps, shares)
+        loss += ssim_weight * (1 - shares.sum() / count)
+        factor = float32(-ssim_weight / count)
+        ssim_gradient(drawn, wanted, height, width, maps, factor, gradient)
+    return loss

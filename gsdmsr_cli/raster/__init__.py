@@ -9,6 +9,13 @@ An engine is a module of this package with two functions::
                   sh_degree: int | None = None, with_depth: bool = False) -> Frame
         # background is (3,); colours use the first (sh_degree + 1)^2 coefficients, all by default
 
+and, if it can do both in one go faster than one after the other::
+
+    def compare(splats: Splats, camera: Camera, background: Tensor, target: Tensor,
+                ssim_weight: float, sh_degree: int | None = None) -> tuple[Tensor, Tensor]
+        # what ``training.losses.photometric_loss`` says of the drawn picture, and the loss's
+        # gradient by the positions on the screen, (N, 2) [1 / px]
+
 Gradients reach all five tensors of the splats; ``frame.means2d`` is part of the graph, so that
 ``frame.means2d.retain_grad()`` gives density control its statistic. Every engine is held to
 ``reference`` by tests/raster/test_conformance.py.
@@ -16,7 +23,7 @@ Gradients reach all five tensors of the splats; ``frame.means2d`` is part of the
 
 from __future__ import annotations
 
-from typing import Protocol, cast
+from typing import Protocol, cast, runtime_checkable
 
 from torch import Tensor
 
@@ -44,6 +51,22 @@ class Engine(Protocol):
         with_depth: bool = False,
     ) -> Frame:
         """Draw the splats."""
+
+
+@runtime_checkable
+class Comparing(Engine, Protocol):
+    """An engine that draws and compares in one go."""
+
+    def compare(
+        self,
+        splats: Splats,
+        camera: Camera,
+        background: Tensor,
+        target: Tensor,
+        ssim_weight: float,
+        sh_degree: int | None = None,
+    ) -> tuple[Tensor, Tensor]:
+        """Return the loss of the picture and its gradient by the positions on the screen."""
 
 
 def load_engine(name: str) -> Engine:

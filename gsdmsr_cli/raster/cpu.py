@@ -13,7 +13,7 @@ from torch.autograd.function import once_differentiable
 
 from gsdmsr_cli.camera import Camera
 from gsdmsr_cli.frame import Frame
-from gsdmsr_cli.kernels import binning, blending, harmonics, projection
+from gsdmsr_cli.kernels import binning, blending, harmonics, looking, projection
 from gsdmsr_cli.kernels.jit import threads
 from gsdmsr_cli.splats import Splats
 from gsdmsr_cli.splatting_constants import TILE
@@ -52,9 +52,57 @@ def rasterize(
     return Frame(rgb=rgb, alpha=alpha, depth=depth, radii=radii, means2d=means2d)
 
 
+def compare(
+    splats: Splats,
+    camera: Camera,
+    background: Tensor,
+    target: Tensor,
+    ssim_weight: float,
+    sh_degree: int | None = None,
+) -> tuple[Tensor, Tensor]:
+    """Draw float32 splats and compare, in one call; see ``gsdmsr_cli.raster``."""
+    degree = splats.sh_degree if sh_degree is None else min(sh_degree, splats.sh_degree)
+    tensors = [tensor.contiguous() for tensor in splats.tensors().values()]
+    loss, on_screen = _Look.apply(camera, degree, background, target, ssim_weight, *tensors)
+    return loss, on_screen
+
+
 def _view(camera: Camera) -> tuple[NDArray[np.float32], NDArray[np.float32], int, int]:
     intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy], np.float32)
     return camera.world_to_camera[:3].astype(np.float32), intrinsics, camera.width, camera.height
+
+
+class _Look(Function):
+    """Stored splats to a loss; its gradients are taken at once, and only passed on later."""
+
+    @staticmethod
+    def forward(
+        ctx: Any,
+        camera: Camera,
+        degree: int,
+        background: Tensor,
+        target: Tensor,
+        ssim_weight: float,
+        *stored: Tensor,
+    ) -> tuple[Tensor, Tensor]:
+        gradients = [torch.empty_like(tensor) for tensor in stored]
+        on_screen = torch.empty(len(stored[0]), 2)
+        view, intrinsics, width, height = _view(camera)
+        loss = looking.look(
+            *map(array, stored), (degree + 1) ** 2, view, intrinsics,
+            camera.centre.astype(np.float32), width, height, array(background.contiguous()),
+            array(target), float(ssim_weight), threads(), *map(array, gradients), array(on_screen),
+        )  # fmt: skip
+        ctx.gradients = gradients
+        ctx.mark_non_differentiable(on_screen)
+        return torch.tensor(loss, dtype=torch.float32), on_screen
+
+    @staticmethod
+    @once_differentiable  # type: ignore[untyped-decorator]
+    def backward(ctx: Any, d_loss: Tensor, _: Any) -> tuple[Tensor | None, ...]:
+        scale = float(d_loss)
+        passed = (g if scale == 1.0 else g * scale for g in ctx.gradients)
+        return None, None, None, None, None, *passed
 
 
 class _Project(Function):

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
 
+from gsdmsr_cli.camera import Camera
 from gsdmsr_cli.model import Model
 from gsdmsr_cli.pictures import HalvedPictures, Pictures
 from gsdmsr_cli.preset import BACKGROUNDS, Preset
-from gsdmsr_cli.raster import Engine
+from gsdmsr_cli.raster import Comparing, Engine
 from gsdmsr_cli.scene import View
-from gsdmsr_cli.splatting import draw
+from gsdmsr_cli.splats import Splats
 from gsdmsr_cli.training.losses import photometric_loss
 
 
@@ -55,14 +57,33 @@ class Observer:
         low = progress < self.preset.training.low_resolution_until
         pictures = self._halved if low else self.pictures
         camera = pictures.camera(view)
-        time = view.time if moving else None
-        frame = draw(model, camera, time, self.engine, self.background, self._sh_degree(progress))
         losses = self.preset.losses
         ssim_weight = losses.ssim if progress < losses.ssim_until else 0.0
-        loss = photometric_loss(frame.rgb, pictures.load(view), ssim_weight)
-        wanted = [*model.tensors().values(), frame.means2d]
-        *gradients, on_screen = torch.autograd.grad(loss, wanted, allow_unused=True)
-        return Look(loss.item(), gradients, on_screen, (camera.width, camera.height))
+        given = camera, self.background, pictures.load(view), ssim_weight, self._sh_degree(progress)
+        splats = model.at(view.time) if moving else model.splats
+        loss, *gradients, on_screen = self._compare(splats, list(model.tensors().values()), *given)
+        return Look(loss, gradients, on_screen, (camera.width, camera.height))
+
+    def _compare(
+        self,
+        splats: Splats,
+        tensors: Sequence[Tensor],
+        camera: Camera,
+        background: Tensor,
+        target: Tensor,
+        ssim_weight: float,
+        degree: int,
+    ) -> tuple[Any, ...]:
+        """Return the loss, its gradients by the tensors and that by the positions on the screen."""
+        if isinstance(self.engine, Comparing):
+            loss, on_screen = self.engine.compare(
+                splats, camera, background, target, ssim_weight, degree
+            )
+            return loss.item(), *torch.autograd.grad(loss, tensors, allow_unused=True), on_screen
+        frame = self.engine.rasterize(splats, camera, background, degree)
+        loss = photometric_loss(frame.rgb, target, ssim_weight)
+        wanted = [*tensors, frame.means2d]
+        return loss.item(), *torch.autograd.grad(loss, wanted, allow_unused=True)
 
     def _sh_degree(self, progress: float) -> int:
         """Return the degree of colour; degree d joins at d times ``sh_start``."""

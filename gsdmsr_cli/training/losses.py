@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 from torch.autograd import Function
@@ -61,21 +60,9 @@ class _Photometric(Function):
         height, width, _ = rgb.shape
         planes = _planes(rgb)
         gradient = torch.empty_like(planes)
-        count = 3 * height * width
-        sums = np.empty(3 * planes.shape[1])
-        size = height, width
-        weight = np.float32((1 - ssim_weight) / count)
-        kernels.l1(array(planes), array(target), *size, weight, array(gradient), sums)
-        loss = (1 - ssim_weight) * sums.sum() / count
-        if ssim_weight > 0:
-            wanted, maps = torch.empty_like(planes), torch.empty(3, *planes.shape)
-            kernels.to_float(array(target), array(wanted))
-            pair = array(planes), array(wanted), *size
-            sums = np.empty(3 * -(-height // kernels.STRIP))
-            kernels.ssim_maps(*pair, array(maps), sums)
-            loss += ssim_weight * (1 - sums.sum() / count)
-            weight = np.float32(-ssim_weight / count)
-            kernels.ssim_gradient(*pair, array(maps), weight, array(gradient))
+        loss = kernels.compare(
+            array(planes), array(target), height, width, float(ssim_weight), array(gradient)
+        )
         ctx.gradient = gradient[:, :height, :width].permute(1, 2, 0)
         return torch.tensor(loss, dtype=torch.float32)
 

@@ -20,8 +20,9 @@ from raster_scenes import (
 )
 from torch import Tensor
 
-from gsdmsr_cli.raster import Engine, engine_names, load_engine, reference
+from gsdmsr_cli.raster import Comparing, Engine, engine_names, load_engine, reference
 from gsdmsr_cli.splatting_constants import ALPHA_MAX, TRANSMITTANCE_STOP
+from gsdmsr_cli.training.losses import photometric_loss
 
 FORWARD = 1e-4  # largest error of a pixel; of depth, relative to the farthest splat
 BACKWARD = 1e-3  # error of a gradient in the L2 norm, relative
@@ -158,6 +159,31 @@ def test_zero_splats_give_the_background(placed: Placed) -> None:
     assert not frame.alpha.any()
 
 
+def compared(placed: Placed, name: str, ssim: float) -> tuple[list[Tensor], list[Tensor]]:
+    """Loss, gradients and screen gradients by ``compare``, and by drawing first."""
+    engine, device = placed
+    if not isinstance(engine, Comparing):
+        pytest.skip("the engine draws and compares one after the other")
+    of, rng = case(name), torch.Generator().manual_seed(3)
+    shape = 3, of.camera.height, of.camera.width
+    target = torch.randint(256, shape, generator=rng, dtype=torch.uint8).to(device)
+    background = of.background.to(device)
+    leaves = of.splats.map(lambda t: t.detach().clone().to(device).requires_grad_())
+    tensors = list(leaves.tensors().values())
+    loss, on_screen = engine.compare(leaves, of.camera, background, target, ssim, of.sh_degree)
+    found = [loss, *torch.autograd.grad(2 * loss, tensors), 2 * on_screen]
+    frame = engine.rasterize(leaves, of.camera, background, of.sh_degree)
+    loss = photometric_loss(frame.rgb, target, ssim)
+    return found, [loss, *torch.autograd.grad(2 * loss, [*tensors, frame.means2d])]
+
+
+@pytest.mark.parametrize("ssim", [0.0, 0.2])
+@pytest.mark.parametrize("name", CASES)
+def test_comparing_is_drawing_and_then_comparing(placed: Placed, name: str, ssim: float) -> None:
+    for found, expected in zip(*compared(placed, name, ssim), strict=True):
+        torch.testing.assert_close(found, expected, atol=1e-7, rtol=1e-5)
+
+
 @pytest.fixture
 def numba_threads() -> Iterator[None]:
     numba = pytest.importorskip("numba")
@@ -176,10 +202,14 @@ def test_result_does_not_depend_on_the_number_of_threads(name: str) -> None:
     if numba.config.NUMBA_NUM_THREADS < 2:
         pytest.skip("numba was started with one thread")
     engine, weights = load_engine("cpu"), pixel_weights(case(name))
-    drawn = []
+    drawn: list[Drawing] = []
+    losses: list[list[Tensor]] = []
     for threads in (1, 2):
         numba.set_num_threads(threads)
         drawn.append(draw(engine, case(name), weights, "cpu", torch.float32))
+        losses.append([t for w in (0.0, 0.2) for t in compared((engine, "cpu"), name, w)[0]])
+    for found, expected in zip(*losses, strict=True):
+        assert torch.equal(found, expected)
     one, two = drawn
     for image, pixels in vars(one.frame).items():
         assert torch.equal(pixels, getattr(two.frame, image)), image

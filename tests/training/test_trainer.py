@@ -229,7 +229,10 @@ def test_ssim_counts_up_to_its_end(tiny_scene: Path, monkeypatch: pytest.MonkeyP
         return true(rgb, target, ssim_weight)
 
     monkeypatch.setattr(look, "photometric_loss", remember)
-    after(trainer_of(tiny_scene, preset_of("losses.ssim=0.4", "losses.ssim_until=0.25")), STEPS)
+    after(
+        trainer_of(tiny_scene, preset_of("losses.ssim=0.4", "losses.ssim_until=0.25"), Witness()),
+        STEPS,
+    )
     assert weights == [0.4] * (STEPS // 4) + [0.0] * (STEPS - STEPS // 4)
 
 
@@ -260,7 +263,7 @@ def test_a_training_without_splats_gives_up(tiny_scene: Path) -> None:
 
 
 class Losses:
-    """Loss functions that are not finite when told so."""
+    """Loss functions that are not finite when told so; a Witness asks them."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.factor = 1.0
@@ -280,7 +283,7 @@ def losses(monkeypatch: pytest.MonkeyPatch) -> Losses:
 def test_a_step_without_a_finite_loss_changes_nothing(
     tiny_scene: Path, losses: Losses, factor: float
 ) -> None:
-    trainer = trainer_of(tiny_scene, preset_of())
+    trainer = trainer_of(tiny_scene, preset_of(), Witness())
     after(trainer, 8)
     before = state_of(trainer)
     del before["generator"]
@@ -298,7 +301,8 @@ def test_a_step_without_a_finite_loss_changes_nothing(
 def test_training_gives_up_after_many_losses_in_a_row_that_are_not_finite(
     tiny_scene: Path, losses: Losses
 ) -> None:
-    trainer = trainer_of(tiny_scene, preset_of("training.steps=1000", "density.start=999"))
+    preset = preset_of("training.steps=1000", "density.start=999")
+    trainer = trainer_of(tiny_scene, preset, Witness())
     losses.factor = math.nan
     after(trainer, PATIENCE - 1)
     losses.factor = 1.0
