@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import pairwise
+from itertools import accumulate, pairwise
 from typing import Any, NamedTuple
 
 import torch
@@ -48,11 +48,17 @@ def new_network(widths: Sequence[int], generator: torch.Generator) -> list[Layer
 
 def apply_network(layers: Sequence[Layer], x: Tensor) -> Tensor:
     """Return the network's output (N, outputs) for the first columns of x (N, inputs or more)."""
-    tensors = [tensor for layer in layers for tensor in layer]
+    return apply_networks([layers], x)[0]
+
+
+def apply_networks(networks: Sequence[Sequence[Layer]], x: Tensor) -> tuple[Tensor, ...]:
+    """Return what each of the networks makes of the same x, see ``apply_network``."""
+    tensors = [tensor for layers in networks for layer in layers for tensor in layer]
     if has_kernels(x, *tensors):
-        y: Tensor = _Network.apply(x.contiguous(), *tensors)
-        return y
-    return apply_network_twin(layers, x)
+        depths = [len(layers) for layers in networks]
+        outputs: tuple[Tensor, ...] = _Networks.apply(x.contiguous(), depths, *tensors)
+        return outputs
+    return tuple(apply_network_twin(layers, x) for layers in networks)
 
 
 def apply_network_twin(layers: Sequence[Layer], x: Tensor) -> Tensor:
@@ -63,28 +69,44 @@ def apply_network_twin(layers: Sequence[Layer], x: Tensor) -> Tensor:
     return x @ layers[-1].weight + layers[-1].bias
 
 
-class _Network(Function):
+class _Networks(Function):
+    """Networks side by side, whose gradients by x are summed on the way."""
+
     @staticmethod
-    def forward(ctx: Any, x: Tensor, *tensors: Tensor) -> Tensor:
-        weights, biases = (tuple(map(array, part)) for part in (tensors[::2], tensors[1::2]))
-        columns = [weight.shape[1] for weight in weights]
-        width = columns[-1] + -columns[-1] % LANES
-        outputs = torch.empty(len(x) * (sum(columns[:-1]) + width))
-        kernels.forward(array(x), weights, biases, array(outputs))
-        ctx.layers = weights, biases
-        ctx.save_for_backward(x, outputs, *tensors)
-        y = outputs[len(outputs) - len(x) * width :].view(len(x), width)
-        return y[:, : columns[-1]]
+    def forward(ctx: Any, x: Tensor, depths: Sequence[int], *tensors: Tensor) -> tuple[Tensor, ...]:
+        ctx.networks, kept, results = [], [], []
+        for own in _split(tensors, depths):
+            layers = tuple(map(array, own[::2])), tuple(map(array, own[1::2]))
+            columns = [weight.shape[1] for weight in layers[0]]
+            width = columns[-1] + -columns[-1] % LANES
+            outputs = torch.empty(len(x) * (sum(columns[:-1]) + width))
+            kernels.forward(array(x), *layers, array(outputs))
+            ctx.networks.append(layers)
+            kept.append(outputs)
+            y = outputs[len(outputs) - len(x) * width :].view(len(x), width)
+            results.append(y[:, : columns[-1]])
+        ctx.depths = depths
+        ctx.save_for_backward(x, *kept, *tensors)
+        return tuple(results)
 
     @staticmethod
     @once_differentiable  # type: ignore[untyped-decorator]
-    def backward(ctx: Any, d_out: Tensor) -> tuple[Tensor | None, ...]:
-        x, outputs, *tensors = ctx.saved_tensors
+    def backward(ctx: Any, *d_results: Tensor) -> tuple[Tensor | None, ...]:
+        x, *saved = ctx.saved_tensors
+        kept, tensors = saved[: len(ctx.depths)], saved[len(ctx.depths) :]
         wanted = ctx.needs_input_grad[0]
         d_x = torch.empty_like(x) if wanted else torch.empty(0, 0)
         gradients = [torch.empty_like(tensor) for tensor in tensors]
-        kernels.backward(
-            array(x), *ctx.layers, array(outputs), array(d_out.contiguous()),
-            tuple(map(array, gradients[::2])), tuple(map(array, gradients[1::2])), array(d_x),
-        )  # fmt: skip
-        return d_x if wanted else None, *gradients
+        parts = zip(ctx.networks, kept, d_results, _split(gradients, ctx.depths), strict=True)
+        for i, (layers, outputs, d_result, own) in enumerate(parts):
+            kernels.backward(
+                array(x), *layers, array(outputs), array(d_result.contiguous()),
+                tuple(map(array, own[::2])), tuple(map(array, own[1::2])), array(d_x), i > 0,
+            )  # fmt: skip
+        return d_x if wanted else None, None, *gradients
+
+
+def _split(tensors: Sequence[Tensor], depths: Sequence[int]) -> list[Sequence[Tensor]]:
+    """Return the tensors of each network, two for a layer."""
+    ends = [2 * end for end in accumulate(depths)]
+    return [tensors[end - 2 * depth : end] for end, depth in zip(ends, depths, strict=True)]

@@ -137,7 +137,7 @@ def forward(x, weights, biases, outputs):
 
 
 @parallel
-def backward(x, weights, biases, outputs, d_y, d_weights, d_biases, d_x):
+def backward(x, weights, biases, outputs, d_y, d_weights, d_biases, d_x, add):
     """Write the gradients of weights, biases and inputs.
 
     Args:
@@ -145,6 +145,7 @@ def backward(x, weights, biases, outputs, d_y, d_weights, d_biases, d_x):
         d_y: (N, outputs) gradient of the last layer's output.
         d_weights, d_biases: out, one array per layer.
         d_x: like x, out, 0 in the columns that are not read; or (0, 0) if not wanted.
+        add: add to ``d_x`` what it holds already.
     """
     n, layers, x_flat, x_row = x.shape[0], len(weights), x.reshape(-1), x.shape[1]
     widths, turned, offsets = _packed(weights, biases, True)
@@ -182,7 +183,8 @@ def backward(x, weights, biases, outputs, d_y, d_weights, d_biases, d_x):
                     _mask(before, outputs, x_at + start * k, rows * k)
                     after, before = before, after
                 elif wanted:
-                    d_x_flat[start * x_row : (start + rows) * x_row] = float32(0)
+                    if not add:
+                        d_x_flat[start * x_row : (start + rows) * x_row] = float32(0)
                     _add_product(
                         after, 0, o, 1, rows, turned, w_at, k, o, d_x_flat, start * x_row, x_row, k
                     )

@@ -86,12 +86,17 @@ class MultiscaleMotion:
         All grids are read in one go, the coarse one first: its decoder reads those columns only.
         """
         features = self._features(self.coarse + self._active(), splats, time)
-        offset = network.apply_network(self.coarse_decoder, features)
         if not self.fine_active:
+            offset = network.apply_network(self.coarse_decoder, features)
             return replace(splats, means=splats.means + offset)
-        if not self.options.pyramid:
-            features = features[:, self.options.coarse_channels :]
-        return displace(splats, network.apply_network(self.decoder, features), offset)
+        if self.options.pyramid:
+            decoders = [self.coarse_decoder, self.decoder]
+            offset, deformation = network.apply_networks(decoders, features)
+        else:
+            offset = network.apply_network(self.coarse_decoder, features)
+            fine = features[:, self.options.coarse_channels :]
+            deformation = network.apply_network(self.decoder, fine)
+        return displace(splats, deformation, offset)
 
     def _active(self) -> list[planes.Level]:
         return self.fine if self.fine_active else []

@@ -54,6 +54,26 @@ def test_kernels_match_the_twin(widths: list[int], count: int) -> None:
         assert_near(a.grad, b.grad, 1e-4, f"gradient {i}")
 
 
+def test_networks_side_by_side_are_the_networks_one_by_one() -> None:
+    """The gradient of what they share is the sum, also where one reads fewer columns."""
+    widths = [[16, 3], [48, 16, 10], [32, 32, 20]]
+    start = [torch.randn(77, 48, generator=generator(7))]
+    start += [tensor for seed, own in enumerate(widths) for tensor in tensors_of(own, seed)]
+    results = []
+    for together in (True, False):
+        x, *tensors = leaves(start, torch.float32)
+        layers = layers_of(tensors)
+        networks = [layers[:1], layers[1:3], layers[3:]]
+        if together:
+            found = network.apply_networks(networks, x)
+        else:
+            found = tuple(network.apply_network(layers, x) for layers in networks)
+        torch.cat(found, dim=1).square().sum().backward()
+        results.append([*found, x.grad, *(tensor.grad for tensor in tensors)])
+    for ours, truth in zip(*results, strict=True):
+        assert_near(ours, truth, 1e-5, "outputs and gradients")
+
+
 def test_inputs_need_not_be_contiguous_nor_want_a_gradient() -> None:
     x = torch.randn(32, 7, generator=generator(4)).T
     start = tensors_of([32, 16, 5])
