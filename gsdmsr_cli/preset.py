@@ -202,7 +202,7 @@ class DensityOptions:
     every: int = 100
     start: int = 300
     until: float = 0.35
-    gradient: float = 1.1e-3
+    gradient: float = 9e-4
     split_scale: float = 0.01
     prune_scale: float = 0.1
     prune_opacity: float = 0.005
