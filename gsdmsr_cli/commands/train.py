@@ -27,7 +27,7 @@ from gsdmsr_cli.scene import Scene
 from gsdmsr_cli.training.loop import train
 from gsdmsr_cli.training.schedule import new_clock
 from gsdmsr_cli.training.trainer import Trainer
-from gsdmsr_cli.training.warm_up import warm_up
+from gsdmsr_cli.training.warm_up import warm_up, warm_up_motion
 
 MAY_CHANGE = {
     "training": ("budget", "steps", "threads", "checkpoint_minutes"),
@@ -101,13 +101,16 @@ def _prepare(scene: Scene, options: Preset, device: str) -> Trainer:
 def _start_work(trainer: Trainer, device: str) -> float:
     """Make all processes of a training ready for its first step; return how long that took [s]."""
 
-    def prepare() -> float:
-        return warm_up(trainer.scene, trainer.preset, trainer.observer.engine)
+    given = trainer.scene, trainer.preset, trainer.observer.engine
+
+    def prepare_helper() -> None:
+        warm_up_motion(*given)
+        warm_up(*given)
 
     started = time.perf_counter()
     if device == "cpu":
-        trainer.hire(prepare)
-    prepare()
+        trainer.hire(prepare_helper)
+    warm_up(*given)
     trainer.team.wait()
     return time.perf_counter() - started
 

@@ -1,0 +1,69 @@
+"""Warming up: afterwards a training meets no kernel for the first time."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from training_checks import OPTIONS, STEPS, preset_of, trainer_of
+
+from gsdmsr_cli.raster import best_engine
+from gsdmsr_cli.training.warm_up import warm_up, warm_up_motion
+
+IN_A_NEW_PROCESS = """
+import importlib, json, pkgutil, sys
+from pathlib import Path
+from gsdmsr_cli import kernels
+from gsdmsr_cli.formats import read_scene
+from gsdmsr_cli.pictures import Pictures
+from gsdmsr_cli.preset import load_preset
+from gsdmsr_cli.raster import best_engine
+from gsdmsr_cli.training.trainer import Trainer
+from gsdmsr_cli.training.warm_up import warm_up, warm_up_motion
+
+def compiled():
+    found = {}
+    for module in pkgutil.iter_modules(kernels.__path__):
+        loaded = importlib.import_module(f"{kernels.__name__}.{module.name}")
+        for name, value in vars(loaded).items():
+            if hasattr(value, "overloads"):
+                found[f"{module.name}.{name}"] = len(value.overloads)
+    return found
+
+scene, options = read_scene(Path(sys.argv[1])), json.loads(sys.argv[2])
+preset, engine, stages = load_preset("dnerf", None, options), best_engine("cpu"), []
+warm_up_motion(scene, preset, engine)
+stages.append(compiled())
+warm_up(scene, preset, engine)
+stages.append(compiled())
+trainer = Trainer(scene, preset, engine, Pictures((1.0, 1.0, 1.0), 1, 1 << 24))
+for _ in range(int(sys.argv[3])):
+    trainer.step()
+stages.append(compiled())
+print(json.dumps(stages))
+"""
+
+
+@pytest.mark.parametrize("motion", ["multiscale", "hexplane"])
+def test_training_needs_no_kernel_that_was_not_warmed_up(tiny_scene: Path, motion: str) -> None:
+    options = json.dumps([*OPTIONS, f"motion={{name: {motion}}}"])
+    command = [sys.executable, "-c", IN_A_NEW_PROCESS, str(tiny_scene), options, str(STEPS)]
+    ended = subprocess.run(command, capture_output=True, text=True, check=True)
+    by_motion, by_all, trained = json.loads(ended.stdout)
+    assert trained == by_all
+    for kernel in ("planes.lookup", "planes.lookup_backward", "network.forward"):
+        assert by_motion[kernel] == by_all[kernel] > 0
+    assert by_motion["looking.look"] == 0 < by_all["looking.look"]
+
+
+@pytest.mark.parametrize("warm", [warm_up, warm_up_motion])
+def test_warming_up_leaves_the_random_state(tiny_scene: Path, warm: object) -> None:
+    trainer = trainer_of(tiny_scene, preset_of())
+    before = torch.random.get_rng_state()
+    assert callable(warm)
+    warm(trainer.scene, trainer.preset, best_engine("cpu"))
+    assert torch.equal(torch.random.get_rng_state(), before)
