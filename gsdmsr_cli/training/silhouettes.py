@@ -11,8 +11,8 @@ from gsdmsr_cli.camera import Camera
 from gsdmsr_cli.pictures import Pictures
 from gsdmsr_cli.scene import Scene
 
-CANDIDATES = 20
-"""Random points per point wanted."""
+CANDIDATES, MOST_CANDIDATES = 20, 500_000
+"""Random points per point wanted, and how many at most: each takes about 1 kB for a moment."""
 
 SHARPNESS = 4.0
 """Points are drawn with the probability of their share of silhouettes to this power."""
@@ -54,7 +54,8 @@ def sample_points(
         count: number of points.
         generator: source of the random points.
     """
-    candidates = (2 * torch.rand(CANDIDATES * count, 3, generator=generator) - 1) * scene.bound
+    tried = min(CANDIDATES * count, MOST_CANDIDATES)
+    candidates = (2 * torch.rand(tried, 3, generator=generator) - 1) * scene.bound
     inside, seen = torch.zeros(len(candidates)), torch.zeros(len(candidates))
     colours = torch.zeros(len(candidates), 3)
     plain = (background * 255).round()
