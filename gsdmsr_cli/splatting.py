@@ -1,4 +1,7 @@
-"""THE renderer: training, render and eval all draw a model through here."""
+"""THE renderer: whoever wants a picture of a model draws it through here.
+
+Training wants gradients and no picture; see ``training.look``.
+"""
 
 from __future__ import annotations
 

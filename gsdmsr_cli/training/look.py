@@ -4,18 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor
 
-from gsdmsr_cli.camera import Camera
 from gsdmsr_cli.model import Model
 from gsdmsr_cli.pictures import HalvedPictures, Pictures
 from gsdmsr_cli.preset import BACKGROUNDS, Preset
 from gsdmsr_cli.raster import Comparing, Engine
 from gsdmsr_cli.scene import View
-from gsdmsr_cli.splats import Splats
 from gsdmsr_cli.training.losses import photometric_loss
 
 
@@ -59,31 +56,21 @@ class Observer:
         camera = pictures.camera(view)
         losses = self.preset.losses
         ssim_weight = losses.ssim if progress < losses.ssim_until else 0.0
-        given = camera, self.background, pictures.load(view), ssim_weight, self._sh_degree(progress)
+        target, degree = pictures.load(view), self._sh_degree(progress)
         splats = model.at(view.time) if moving else model.splats
-        loss, *gradients, on_screen = self._compare(splats, list(model.tensors().values()), *given)
-        return Look(loss, gradients, on_screen, (camera.width, camera.height))
-
-    def _compare(
-        self,
-        splats: Splats,
-        tensors: Sequence[Tensor],
-        camera: Camera,
-        background: Tensor,
-        target: Tensor,
-        ssim_weight: float,
-        degree: int,
-    ) -> tuple[Any, ...]:
-        """Return the loss, its gradients by the tensors and that by the positions on the screen."""
+        tensors = list(model.tensors().values())
+        gradients: Sequence[Tensor | None]
         if isinstance(self.engine, Comparing):
             loss, on_screen = self.engine.compare(
-                splats, camera, background, target, ssim_weight, degree
+                splats, camera, self.background, target, ssim_weight, degree
             )
-            return loss.item(), *torch.autograd.grad(loss, tensors, allow_unused=True), on_screen
-        frame = self.engine.rasterize(splats, camera, background, degree)
-        loss = photometric_loss(frame.rgb, target, ssim_weight)
-        wanted = [*tensors, frame.means2d]
-        return loss.item(), *torch.autograd.grad(loss, wanted, allow_unused=True)
+            gradients = torch.autograd.grad(loss, tensors, allow_unused=True)
+        else:
+            frame = self.engine.rasterize(splats, camera, self.background, degree)
+            loss = photometric_loss(frame.rgb, target, ssim_weight)
+            wanted = [*tensors, frame.means2d]
+            *gradients, on_screen = torch.autograd.grad(loss, wanted, allow_unused=True)
+        return Look(loss.item(), gradients, on_screen, (camera.width, camera.height))
 
     def _sh_degree(self, progress: float) -> int:
         """Return the degree of colour; degree d joins at d times ``sh_start``."""

@@ -12,7 +12,7 @@ from gsdmsr_cli.pictures import Pictures
 from gsdmsr_cli.scene import Scene
 
 CANDIDATES, MOST_CANDIDATES = 20, 500_000
-"""Random points per point wanted, and how many at most: each takes about 1 kB for a moment."""
+"""Random points per point wanted, and how many at most, for the sake of memory."""
 
 SHARPNESS = 4.0
 """Points are drawn with the probability of their share of silhouettes to this power."""

@@ -1,7 +1,7 @@
 """Several views of a step at once, each by a process of its own.
 
 The kernels of one view are too short to keep two cores busy, and the Python between them runs on
-one. Two processes, each with a view and a core, look at about a fifth more views in the same time.
+one. Two processes, each with a view and a core, get more views done in the same time.
 Helper processes are forked, so that they share the pictures; they are told over a pipe what to look
 at, read the model from shared memory and answer there with the gradients. Gradients do not depend
 on who has taken them, so a training gives the same result with and without helpers.
