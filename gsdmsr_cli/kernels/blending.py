@@ -244,43 +244,64 @@ def blend_backward(
 
 
 @inline
-def _compare_plain(target, background, top, left, bottom, right):
+def _target_row(pixels, at, inside, row):
+    """Return a tile row of an 8-bit picture in [0, 1], 0 beyond the first ``inside`` pixels."""
+    if inside == TILE:
+        return simd.load_bytes(pixels, at) * _SCALE
+    for x in range(TILE):
+        row[x] = float32(pixels[at + x]) if x < inside else float32(0)
+    return simd.load(row, 0) * _SCALE
+
+
+@inline
+def _distance(difference):
+    return simd.maximum(difference, simd.splat(float32(0)) - difference)
+
+
+@inline
+def _compare_plain(row, target, background, top, left, bottom, right):
     """Return the sum of |background - target| over a tile that no splat touches."""
-    total = float32(0)
+    pixels, width, plane = target.reshape(-1), target.shape[2], target.shape[1] * target.shape[2]
+    total, covered = simd.splat(float32(0)), _columns_below(right - left)
     for channel in range(3):
+        shade = covered * background[channel]
         for y in range(top, bottom):
-            for x in range(left, right):
-                total += abs(background[channel] - float32(target[channel, y, x]) * _SCALE)
-    return total
+            at = channel * plane + y * width + left
+            total = total + _distance(shade - _target_row(pixels, at, right - left, row))
+    return simd.reduce_sum(total)
+
+
+@inline
+def _columns_below(count):
+    """Return the vector that is 1 in the first ``count`` lanes, else 0."""
+    limit = simd.splat(float32(count) - _HALF)
+    return simd.where_ge(limit, simd.iota(float32(0)), simd.splat(float32(1)))
 
 
 @inline
 def _compare(block, row, target, background, top, left, bottom, right, weight):
     """Return the sum of |rgb - target| of a drawn tile, and prepare its block for gradients."""
-    total, one = float32(0), simd.splat(float32(1))
+    pixels, width, plane = target.reshape(-1), target.shape[2], target.shape[1] * target.shape[2]
+    one, zero, covered = simd.splat(float32(1)), simd.splat(float32(0)), _columns_below(right - left)
+    up, down, total = simd.splat(weight), simd.splat(-weight), simd.splat(float32(0))
     for y in range(TILE):
-        o, inside = y * TILE, right - left if top + y < bottom else 0
-        passed = simd.load(block, o)
-        rest = simd.splat(float32(0))
+        o, passed, rest = y * TILE, simd.load(block, y * TILE), zero
+        colour = simd.load(block, _BLOCK + o)
         for channel in range(3):
-            shade = simd.load(block, (1 + channel) * _BLOCK + o) + passed * background[channel]
-            simd.store(row, channel * TILE, shade)
-        for channel in range(3):
-            shade = simd.load(row, channel * TILE)
-            for x in range(inside):
-                value = row[channel * TILE + x]
-                difference = value - float32(target[channel, top + y, left + x]) * _SCALE
-                total += abs(difference)
-                sign = float32(difference > 0) - float32(difference < 0)
-                row[channel * TILE + x] = weight * sign
-            for x in range(inside, TILE):
-                row[channel * TILE + x] = float32(0)
-            slope = simd.load(row, channel * TILE)
+            shade, slope = colour + passed * background[channel], zero
+            if top + y < bottom:
+                at = channel * plane + (top + y) * width + left
+                target_row = _target_row(pixels, at, right - left, row)
+                difference = shade * covered - target_row
+                total = total + _distance(difference)
+                slope = simd.where_positive(difference, up)
+                slope = slope + simd.where_positive(zero - difference, down)
             rest = rest + slope * shade
+            colour = simd.load(block, (2 + channel) * _BLOCK + o)  # its place is taken next
             simd.store(block, (2 + channel) * _BLOCK + o, slope)
         simd.store(block, o, one)
         simd.store(block, _BLOCK + o, rest)
-    return total
+    return simd.reduce_sum(total)
 
 
 @parallel
@@ -300,7 +321,7 @@ def blend_l1(records, entries, starts, busiest, columns, background, target, wei
     for part in prange(PARTS):
         own = sums[part].reshape(-1)
         own[:] = float32(0)
-        block, row = np.empty(5 * _BLOCK, np.float32), np.empty(3 * TILE, np.float32)
+        block, row = np.empty(5 * _BLOCK, np.float32), np.empty(TILE, np.float32)
         for turn in range(part, busiest.shape[0], PARTS):
             tile = busiest[turn]
             tile_y, tile_x, x0, y0 = _corner(tile, columns)
@@ -308,7 +329,7 @@ def blend_l1(records, entries, starts, busiest, columns, background, target, wei
             bottom, right = min(top + TILE, height), min(left + TILE, width)
             start, end = starts[tile], starts[tile + 1]
             if start == end:
-                losses[tile] = _compare_plain(target, background, top, left, bottom, right)
+                losses[tile] = _compare_plain(row, target, background, top, left, bottom, right)
                 continue
             end = _draw(block, records, entries, start, end, x0, y0)
             losses[tile] = _compare(

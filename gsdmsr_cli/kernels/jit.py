@@ -67,11 +67,14 @@ def _load_tbb() -> None:
         return  # OpenMP serves, or Numba's own threads
 
 
-os.environ.setdefault("NUMBA_CACHE_DIR", str(_cache_folder()))
 _keep_large_blocks_in_the_heap()
 _load_tbb()
 
-import numba  # noqa: E402  (reads NUMBA_CACHE_DIR when imported)
+import numba  # noqa: E402  (finds TBB only if that is loaded by now)
+
+# set in both places: Numba has read its environment already if anybody imported it before, and
+# reads it again when it changes
+numba.config.CACHE_DIR = os.environ.setdefault("NUMBA_CACHE_DIR", str(_cache_folder()))
 
 FLAGS = {"reassoc", "contract", "arcp", "nsz", "afn"}
 """Floating-point liberties of all kernels. Not nnan and ninf: kernels test for non-finite input."""

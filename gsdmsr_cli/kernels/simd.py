@@ -24,6 +24,7 @@ _FLOAT = ir.FloatType()
 _INT = ir.IntType(32)
 _VECTOR = ir.VectorType(_FLOAT, LANES)
 _VECTOR_INT = ir.VectorType(_INT, LANES)
+_VECTOR_BYTE = ir.VectorType(ir.IntType(8), LANES)
 _FAST = tuple(sorted(FLAGS))
 
 
@@ -92,6 +93,21 @@ def load(_typing: Any, array: Any, index: Any) -> Any:
         loaded = builder.load(_address(context, builder, sig.args[0], args[0], at))
         loaded.align = 4
         return loaded
+
+    return vector(array, index), emit
+
+
+@intrinsic
+def load_bytes(_typing: Any, array: Any, index: Any) -> Any:
+    """Return the floats of array[index : index + 16], a flat array of uint8."""
+
+    def emit(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        at = context.cast(builder, args[1], sig.args[1], types.intp)
+        data = context.make_array(sig.args[0])(context, builder, args[0]).data
+        pointer = builder.bitcast(builder.gep(data, [at]), _VECTOR_BYTE.as_pointer())
+        loaded = builder.load(pointer)
+        loaded.align = 1
+        return builder.uitofp(loaded, _VECTOR)
 
     return vector(array, index), emit
 
