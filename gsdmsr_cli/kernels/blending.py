@@ -11,6 +11,7 @@ that nothing per pixel and splat has to be stored.
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 from numba import float32, prange
@@ -69,96 +70,118 @@ def _corner(tile, columns):
     return tile_y, tile_x, float32(tile_x * TILE) + _HALF, float32(tile_y * TILE) + _HALF
 
 
-@inline
-def _draw(block, records, entries, start, end, x0, y0):
-    """Blend a tile's entries into a block of transmittance, red, green and blue.
+def _make_draw(keep: bool) -> Any:
+    """Make the drawing of a tile; it may keep the falloffs for ``_make_differentiate``."""
 
-    Returns the entry after the last one blended.
-    """
-    one, zero = simd.splat(float32(1)), simd.splat(float32(0))
-    cut, full, floor = simd.splat(_ALPHA_MIN), simd.splat(_ALPHA_MAX), simd.splat(float32(-126))
-    for y in range(TILE):
-        simd.store(block, y * TILE, one)
-        simd.store(block, _BLOCK + y * TILE, zero)
-        simd.store(block, 2 * _BLOCK + y * TILE, zero)
-        simd.store(block, 3 * _BLOCK + y * TILE, zero)
-    top, bottom = 0, TILE - 1
-    k = start
-    while k < end:
-        if ((k - start) & 15) == 0 and k > start:
-            top, bottom = _unfinished_rows(block, top, bottom)
-            if top > bottom:
-                break
-        i, rows = entries[k, 0], entries[k, 1]
-        k += 1
-        dx = simd.iota(x0 - records[i, 0])
-        at_row = dx * dx * records[i, 2] + simd.splat(records[i, 5])
-        slope, curve = dx * records[i, 3], records[i, 4]
-        red, green, blue = records[i, 6], records[i, 7], records[i, 8]
-        for y in range(max(rows & 255, top), min(rows >> 8, bottom) + 1):
-            dy = y0 + float32(y) - records[i, 1]
-            power = at_row + (slope + simd.splat(curve * dy)) * dy
-            alpha = simd.minimum(simd.exp2(simd.maximum(power, floor)), full)
-            alpha = simd.where_ge(alpha, cut, alpha)
-            o = y * TILE
-            before = simd.load(block, o)
-            weight = alpha * before
-            simd.store(block, o, before - weight)
-            o += _BLOCK
-            simd.store(block, o, simd.load(block, o) + weight * red)
-            o += _BLOCK
-            simd.store(block, o, simd.load(block, o) + weight * green)
-            o += _BLOCK
-            simd.store(block, o, simd.load(block, o) + weight * blue)
-    return k
+    @inline
+    def draw(block, kept, records, entries, start, end, x0, y0):
+        """Blend a tile's entries into a block of transmittance, red, green and blue.
+
+        Returns the entry after the last one blended.
+        """
+        one, zero = simd.splat(float32(1)), simd.splat(float32(0))
+        cut, full, floor = simd.splat(_ALPHA_MIN), simd.splat(_ALPHA_MAX), simd.splat(float32(-126))
+        for y in range(TILE):
+            simd.store(block, y * TILE, one)
+            simd.store(block, _BLOCK + y * TILE, zero)
+            simd.store(block, 2 * _BLOCK + y * TILE, zero)
+            simd.store(block, 3 * _BLOCK + y * TILE, zero)
+        top, bottom, at = 0, TILE - 1, 0
+        k = start
+        while k < end:
+            if ((k - start) & 15) == 0 and k > start:
+                top, bottom = _unfinished_rows(block, top, bottom)
+                if top > bottom:
+                    break
+            i, rows = entries[k, 0], entries[k, 1]
+            k += 1
+            dx = simd.iota(x0 - records[i, 0])
+            at_row = dx * dx * records[i, 2] + simd.splat(records[i, 5])
+            slope, curve = dx * records[i, 3], records[i, 4]
+            red, green, blue = records[i, 6], records[i, 7], records[i, 8]
+            for y in range(max(rows & 255, top), min(rows >> 8, bottom) + 1):
+                dy = y0 + float32(y) - records[i, 1]
+                power = at_row + (slope + simd.splat(curve * dy)) * dy
+                free = simd.exp2(simd.maximum(power, floor))
+                if keep:
+                    simd.store(kept, at, free)
+                    at += TILE
+                alpha = simd.minimum(free, full)
+                alpha = simd.where_ge(alpha, cut, alpha)
+                o = y * TILE
+                before = simd.load(block, o)
+                weight = alpha * before
+                simd.store(block, o, before - weight)
+                o += _BLOCK
+                simd.store(block, o, simd.load(block, o) + weight * red)
+                o += _BLOCK
+                simd.store(block, o, simd.load(block, o) + weight * green)
+                o += _BLOCK
+                simd.store(block, o, simd.load(block, o) + weight * blue)
+        return k
+
+    return draw
 
 
-@inline
-def _differentiate(block, records, entries, start, end, x0, y0, own):
-    """Add a tile's shares of the gradients of its splats to ``own``.
+def _make_differentiate(from_kept: bool) -> Any:
+    """Make the gradients of a tile, from falloffs that are kept or computed again."""
 
-    The block holds the transmittance, 1 at first, what is left of d_rgb . rgb, and d_rgb.
-    """
-    one, zero = simd.splat(float32(1)), simd.splat(float32(0))
-    cut, full, floor = simd.splat(_ALPHA_MIN), simd.splat(_ALPHA_MAX), simd.splat(float32(-126))
-    top, bottom = 0, TILE - 1
-    for k in range(start, end):
-        if ((k - start) & 15) == 0 and k > start:
-            top, bottom = _unfinished_rows(block, top, bottom)
-        i, rows = entries[k, 0], entries[k, 1]
-        dx = simd.iota(x0 - records[i, 0])
-        at_row = dx * dx * records[i, 2] + simd.splat(records[i, 5])
-        slope, curve = dx * records[i, 3], records[i, 4]
-        red, green, blue = records[i, 6], records[i, 7], records[i, 8]
-        sum_e, sum_ey, sum_eyy = zero, zero, zero
-        sum_red, sum_green, sum_blue = zero, zero, zero
-        for y in range(max(rows & 255, top), min(rows >> 8, bottom) + 1):
-            dy = y0 + float32(y) - records[i, 1]
-            power = at_row + (slope + simd.splat(curve * dy)) * dy
-            free = simd.exp2(simd.maximum(power, floor))
-            alpha = simd.minimum(free, full)
-            alpha = simd.where_ge(alpha, cut, alpha)
-            o = y * TILE
-            before, left = simd.load(block, o), simd.load(block, _BLOCK + o)
-            d_red = simd.load(block, 2 * _BLOCK + o)
-            d_green = simd.load(block, 3 * _BLOCK + o)
-            d_blue = simd.load(block, 4 * _BLOCK + o)
-            weight = alpha * before
-            share = (d_red * red + d_green * green + d_blue * blue) * weight
-            left = left - share
-            simd.store(block, o, before - weight)
-            simd.store(block, _BLOCK + o, left)
-            e = simd.where_ge(full, free, share - alpha * left / (one - alpha))
-            ey = e * dy
-            sum_e, sum_ey, sum_eyy = sum_e + e, sum_ey + ey, sum_eyy + ey * dy
-            sum_red, sum_green = sum_red + weight * d_red, sum_green + weight * d_green
-            sum_blue = sum_blue + weight * d_blue
-        sum_ex = sum_e * dx
-        shares = simd.reduce_sums(
-            sum_e, sum_ex, sum_ey, sum_ex * dx, sum_ey * dx, sum_eyy,
-            sum_red, sum_green, sum_blue,
-        )  # fmt: skip
-        simd.store(own, i * RECORD, simd.load(own, i * RECORD) + shares)
+    @inline
+    def differentiate(block, kept, records, entries, start, end, x0, y0, own):
+        """Add a tile's shares of the gradients of its splats to ``own``.
+
+        The block holds the transmittance, 1 at first, what is left of d_rgb . rgb, and d_rgb.
+        """
+        one, zero = simd.splat(float32(1)), simd.splat(float32(0))
+        cut, full, floor = simd.splat(_ALPHA_MIN), simd.splat(_ALPHA_MAX), simd.splat(float32(-126))
+        top, bottom, at = 0, TILE - 1, 0
+        for k in range(start, end):
+            if ((k - start) & 15) == 0 and k > start:
+                top, bottom = _unfinished_rows(block, top, bottom)
+            i, rows = entries[k, 0], entries[k, 1]
+            dx = simd.iota(x0 - records[i, 0])
+            at_row = dx * dx * records[i, 2] + simd.splat(records[i, 5])
+            slope, curve = dx * records[i, 3], records[i, 4]
+            red, green, blue = records[i, 6], records[i, 7], records[i, 8]
+            sum_e, sum_ey, sum_eyy = zero, zero, zero
+            sum_red, sum_green, sum_blue = zero, zero, zero
+            for y in range(max(rows & 255, top), min(rows >> 8, bottom) + 1):
+                dy = y0 + float32(y) - records[i, 1]
+                if from_kept:
+                    free = simd.load(kept, at)
+                    at += TILE
+                else:
+                    power = at_row + (slope + simd.splat(curve * dy)) * dy
+                    free = simd.exp2(simd.maximum(power, floor))
+                alpha = simd.minimum(free, full)
+                alpha = simd.where_ge(alpha, cut, alpha)
+                o = y * TILE
+                before, left = simd.load(block, o), simd.load(block, _BLOCK + o)
+                d_red = simd.load(block, 2 * _BLOCK + o)
+                d_green = simd.load(block, 3 * _BLOCK + o)
+                d_blue = simd.load(block, 4 * _BLOCK + o)
+                weight = alpha * before
+                share = (d_red * red + d_green * green + d_blue * blue) * weight
+                left = left - share
+                simd.store(block, o, before - weight)
+                simd.store(block, _BLOCK + o, left)
+                e = simd.where_ge(full, free, share - alpha * left / (one - alpha))
+                ey = e * dy
+                sum_e, sum_ey, sum_eyy = sum_e + e, sum_ey + ey, sum_eyy + ey * dy
+                sum_red, sum_green = sum_red + weight * d_red, sum_green + weight * d_green
+                sum_blue = sum_blue + weight * d_blue
+            sum_ex = sum_e * dx
+            shares = simd.reduce_sums(
+                sum_e, sum_ex, sum_ey, sum_ex * dx, sum_ey * dx, sum_eyy,
+                sum_red, sum_green, sum_blue,
+            )  # fmt: skip
+            simd.store(own, i * RECORD, simd.load(own, i * RECORD) + shares)
+
+    return differentiate
+
+
+_draw, _draw_and_keep = _make_draw(False), _make_draw(True)
+_differentiate, _differentiate_kept = _make_differentiate(False), _make_differentiate(True)
 
 
 @parallel
@@ -184,7 +207,9 @@ def blend(records, entries, starts, busiest, lanes, columns, background, rgb, al
         for turn in range(lane, busiest.shape[0], lanes):
             tile = busiest[turn]
             tile_y, tile_x, x0, y0 = _corner(tile, columns)
-            ends[tile] = _draw(block, records, entries, starts[tile], starts[tile + 1], x0, y0)
+            ends[tile] = _draw(
+                block, block, records, entries, starts[tile], starts[tile + 1], x0, y0
+            )
             for y in range(TILE):
                 o = (tile_y * TILE + y) * stride + tile_x * TILE
                 left = simd.load(block, y * TILE)
@@ -240,7 +265,7 @@ def blend_backward(
                 simd.store(block, 2 * _BLOCK + y * TILE, d_red)
                 simd.store(block, 3 * _BLOCK + y * TILE, d_green)
                 simd.store(block, 4 * _BLOCK + y * TILE, d_blue)
-            _differentiate(block, records, entries, start, end, x0, y0, own)
+            _differentiate(block, block, records, entries, start, end, x0, y0, own)
 
 
 @inline
@@ -282,7 +307,11 @@ def _columns_below(count):
 def _compare(block, row, target, background, top, left, bottom, right, weight):
     """Return the sum of |rgb - target| of a drawn tile, and prepare its block for gradients."""
     pixels, width, plane = target.reshape(-1), target.shape[2], target.shape[1] * target.shape[2]
-    one, zero, covered = simd.splat(float32(1)), simd.splat(float32(0)), _columns_below(right - left)
+    one, zero, covered = (
+        simd.splat(float32(1)),
+        simd.splat(float32(0)),
+        _columns_below(right - left),
+    )
     up, down, total = simd.splat(weight), simd.splat(-weight), simd.splat(float32(0))
     for y in range(TILE):
         o, passed, rest = y * TILE, simd.load(block, y * TILE), zero
@@ -322,6 +351,7 @@ def blend_l1(records, entries, starts, busiest, columns, background, target, wei
         own = sums[part].reshape(-1)
         own[:] = float32(0)
         block, row = np.empty(5 * _BLOCK, np.float32), np.empty(TILE, np.float32)
+        kept = np.empty(0, np.float32)
         for turn in range(part, busiest.shape[0], PARTS):
             tile = busiest[turn]
             tile_y, tile_x, x0, y0 = _corner(tile, columns)
@@ -331,11 +361,13 @@ def blend_l1(records, entries, starts, busiest, columns, background, target, wei
             if start == end:
                 losses[tile] = _compare_plain(row, target, background, top, left, bottom, right)
                 continue
-            end = _draw(block, records, entries, start, end, x0, y0)
+            if (end - start) * _BLOCK > kept.shape[0]:
+                kept = np.empty((end - start) * _BLOCK, np.float32)
+            end = _draw_and_keep(block, kept, records, entries, start, end, x0, y0)
             losses[tile] = _compare(
                 block, row, target, background, top, left, bottom, right, weight
             )
-            _differentiate(block, records, entries, start, end, x0, y0, own)
+            _differentiate_kept(block, kept, records, entries, start, end, x0, y0, own)
 
 
 @parallel

@@ -53,26 +53,22 @@ def spread(d_lines, time, d_planes, axis, chunk):
 
 
 @inline
-def _corners(flat, at, row):
-    return (
-        simd.load(flat, at),
-        simd.load(flat, at + _LANES),
-        simd.load(flat, at + row),
-        simd.load(flat, at + row + _LANES),
-    )
-
-
-@inline
 def _bilinear(flat, at, row, wx, wy):
-    c00, c01, c10, c11 = _corners(flat, at, row)
-    low, high = c00 + (c01 - c00) * wx, c10 + (c11 - c10) * wx
-    return low + (high - low) * wy
+    """Return a bilinear sample and its derivatives by x and y, in cells."""
+    c00, c01 = simd.load(flat, at), simd.load(flat, at + _LANES)
+    c10, c11 = simd.load(flat, at + row), simd.load(flat, at + row + _LANES)
+    low_x, high_x = c01 - c00, c11 - c10
+    low = c00 + low_x * wx
+    by_y = c10 + high_x * wx - low
+    return low + by_y * wy, low_x + (high_x - low_x) * wy, by_y
 
 
 @inline
 def _linear(flat, at, w):
+    """Return a linear sample and its derivative, in cells."""
     low = simd.load(flat, at)
-    return low + (simd.load(flat, at + _LANES) - low) * w
+    by_x = simd.load(flat, at + _LANES) - low
+    return low + by_x * w, by_x
 
 
 @inline
@@ -111,23 +107,14 @@ def lookup(points, box, time, spaces, times, lines, features):
                 for c in range(chunks):
                     xy, xz, yz = c * plane, (chunks + c) * plane, (2 * chunks + c) * plane
                     x, y, z = c * strip, (chunks + c) * strip, (2 * chunks + c) * strip
-                    value = _bilinear(planes, xy + iy * row + x_at, row, wx, wy)
-                    value = value * _bilinear(planes, xz + iz * row + x_at, row, wx, wz)
-                    value = value * _bilinear(planes, yz + iz * row + y_at, row, wy, wz)
-                    value = value * _linear(strips, x + x_at, wx)
-                    value = value * _linear(strips, y + y_at, wy)
-                    value = value * _linear(strips, z + z_at, wz)
+                    value = _bilinear(planes, xy + iy * row + x_at, row, wx, wy)[0]
+                    value = value * _bilinear(planes, xz + iz * row + x_at, row, wx, wz)[0]
+                    value = value * _bilinear(planes, yz + iz * row + y_at, row, wy, wz)[0]
+                    value = value * _linear(strips, x + x_at, wx)[0]
+                    value = value * _linear(strips, y + y_at, wy)[0]
+                    value = value * _linear(strips, z + z_at, wz)[0]
                     simd.store(out, i * width + offset + c * _LANES, value)
             offset += chunks * _LANES
-
-
-@inline
-def _slopes(flat, at, row, wx, wy, d):
-    """Return the gradients in the two coordinates of a bilinear sample, in cells."""
-    c00, c01, c10, c11 = _corners(flat, at, row)
-    low, high = c01 - c00, c11 - c10
-    left, right = c10 - c00, c11 - c01
-    return d * (low + (high - low) * wy), d * (left + (right - left) * wx)
 
 
 @inline
@@ -197,26 +184,21 @@ def lookup_backward(
             x = c * strip + ix * _LANES
             y = (chunks + c) * strip + iy * _LANES
             z = (2 * chunks + c) * strip + iz * _LANES
-            s_xy = _bilinear(planes, xy, row, wx, wy)
-            s_xz = _bilinear(planes, xz, row, wx, wz)
-            s_yz = _bilinear(planes, yz, row, wy, wz)
-            s_x, s_y, s_z = (
-                _linear(strips, x, wx),
-                _linear(strips, y, wy),
-                _linear(strips, z, wz),
-            )
+            s_xy, xy_by_x, xy_by_y = _bilinear(planes, xy, row, wx, wy)
+            s_xz, xz_by_x, xz_by_z = _bilinear(planes, xz, row, wx, wz)
+            s_yz, yz_by_y, yz_by_z = _bilinear(planes, yz, row, wy, wz)
+            s_x, by_x = _linear(strips, x, wx)
+            s_y, by_y = _linear(strips, y, wy)
+            s_z, by_z = _linear(strips, z, wz)
             d = simd.load(d_out, i * width + task * _LANES)
             d_time = d * (s_x * s_y * s_z)
             d_xy, d_xz, d_yz = d_time * s_xz * s_yz, d_time * s_xy * s_yz, d_time * s_xy * s_xz
             d = d * (s_xy * s_xz * s_yz)
             d_x, d_y, d_z = d * s_y * s_z, d * s_x * s_z, d * s_x * s_y
             if d_points.shape[0] > 0:
-                gx, gy = _slopes(planes, xy, row, wx, wy, d_xy)
-                hx, gz = _slopes(planes, xz, row, wx, wz, d_xz)
-                hy, hz = _slopes(planes, yz, row, wy, wz, d_yz)
-                gx = gx + hx + d_x * (simd.load(strips, x + _LANES) - simd.load(strips, x))
-                gy = gy + hy + d_y * (simd.load(strips, y + _LANES) - simd.load(strips, y))
-                gz = gz + hz + d_z * (simd.load(strips, z + _LANES) - simd.load(strips, z))
+                gx = d_xy * xy_by_x + d_xz * xz_by_x + d_x * by_x
+                gy = d_xy * xy_by_y + d_yz * yz_by_y + d_y * by_y
+                gz = d_xz * xz_by_z + d_yz * yz_by_z + d_z * by_z
                 shares[task, i, 0] = _inside(px) * cells * box[0, 0] * simd.reduce_sum(gx)
                 shares[task, i, 1] = _inside(py) * cells * box[0, 1] * simd.reduce_sum(gy)
                 shares[task, i, 2] = _inside(pz) * cells * box[0, 2] * simd.reduce_sum(gz)
