@@ -5,11 +5,8 @@ from __future__ import annotations
 NEAR = 0.2
 """Splats whose centre has camera z at or below this [world units] are not drawn (3DGS)."""
 
-DILATION = 0.1
-"""Variance added to both axes of a splat's screen covariance [px^2], a low-pass.
-
-3DGS adds 0.3, which blurs silhouettes. Mip-Splatting's 2D filter (Yu et al. 2024) has 0.1, about a
-pixel; at equal steps that gave 0.4 dB on jumpingjacks and 0.1 dB on lego."""
+DILATION = 0.3
+"""Variance added to both axes of a splat's screen covariance [px^2], a low-pass (3DGS)."""
 
 ALPHA_MIN = 1.0 / 255.0
 """A splat does not touch a pixel where its alpha falls below this (3DGS)."""
