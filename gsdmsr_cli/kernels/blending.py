@@ -71,13 +71,17 @@ def _corner(tile, columns):
 
 
 def _make_draw(keep: bool) -> Any:
-    """Make the drawing of a tile; it may keep the falloffs for ``_make_differentiate``."""
+    """Make the drawing of a tile, which may keep what ``_make_differentiate`` needs again.
+
+    Computing the falloffs twice would take a fifth of the time of drawing and gradients.
+    """
 
     @inline
     def draw(block, kept, records, entries, start, end, x0, y0):
         """Blend a tile's entries into a block of transmittance, red, green and blue.
 
-        Returns the entry after the last one blended.
+        Returns the entry after the last one blended. ``kept`` has room for a whole tile of
+        falloffs, opacity times Gaussian, for each entry.
         """
         one, zero = simd.splat(float32(1)), simd.splat(float32(0))
         cut, full, floor = simd.splat(_ALPHA_MIN), simd.splat(_ALPHA_MAX), simd.splat(float32(-126))
@@ -279,6 +283,13 @@ def _target_row(pixels, at, inside, row):
 
 
 @inline
+def _columns_below(count):
+    """Return the vector that is 1 in the first ``count`` lanes, else 0."""
+    limit = simd.splat(float32(count) - _HALF)
+    return simd.where_ge(limit, simd.iota(float32(0)), simd.splat(float32(1)))
+
+
+@inline
 def _distance(difference):
     return simd.maximum(difference, simd.splat(float32(0)) - difference)
 
@@ -297,22 +308,12 @@ def _compare_plain(row, target, background, top, left, bottom, right):
 
 
 @inline
-def _columns_below(count):
-    """Return the vector that is 1 in the first ``count`` lanes, else 0."""
-    limit = simd.splat(float32(count) - _HALF)
-    return simd.where_ge(limit, simd.iota(float32(0)), simd.splat(float32(1)))
-
-
-@inline
 def _compare(block, row, target, background, top, left, bottom, right, weight):
     """Return the sum of |rgb - target| of a drawn tile, and prepare its block for gradients."""
     pixels, width, plane = target.reshape(-1), target.shape[2], target.shape[1] * target.shape[2]
-    one, zero, covered = (
-        simd.splat(float32(1)),
-        simd.splat(float32(0)),
-        _columns_below(right - left),
-    )
-    up, down, total = simd.splat(weight), simd.splat(-weight), simd.splat(float32(0))
+    one, zero = simd.splat(float32(1)), simd.splat(float32(0))
+    up, down, total = simd.splat(weight), simd.splat(-weight), zero
+    covered = _columns_below(right - left)
     for y in range(TILE):
         o, passed, rest = y * TILE, simd.load(block, y * TILE), zero
         colour = simd.load(block, _BLOCK + o)

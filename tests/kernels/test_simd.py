@@ -57,6 +57,11 @@ def apply_choices(x, y, value, out):
 
 
 @serial
+def bytes_as_floats(x, at, out):
+    simd.store(out, 0, simd.load_bytes(x, at))
+
+
+@serial
 def apply_reductions(x):
     a = simd.load(x, 0)
     return simd.reduce_sum(a), simd.reduce_max(a)
@@ -183,6 +188,13 @@ def test_load_and_store_touch_16_floats_at_any_offset(at: int, to: int) -> None:
     expected = np.full(40, -1, np.float32)
     expected[to : to + LANES] = x[at : at + LANES]
     assert np.array_equal(out, expected)
+
+
+@pytest.mark.parametrize("at", [0, 1, 13, 240])
+def test_load_bytes_takes_all_values_as_floats(at: int) -> None:
+    x, out = np.arange(256, dtype=np.uint8), np.empty(LANES, np.float32)
+    bytes_as_floats(x, at, out)
+    assert np.array_equal(out, np.arange(at, at + LANES))
 
 
 def test_two_dimensional_arrays_are_indexed_flat() -> None:
