@@ -43,9 +43,10 @@ class Model:
 
     def per_splat(self) -> list[str]:
         """Return the names of all tensors with one row per splat."""
-        own = self.splats.tensors()
+        own, groups = self.splats.tensors(), self.motion.groups()
+        held = {"embeddings", *own}
         return [STORED_AS + name for name in own] + [
-            MOVED_BY + name for name, group in self.motion.groups().items() if group in own
+            MOVED_BY + name for name, group in groups.items() if group in held
         ]
 
 

@@ -167,6 +167,7 @@ class OptimizerOptions:
         sh: of the constant colour coefficient.
         planes: of the motion's plane grids.
         network: of the motion's networks.
+        embeddings: of the features that a motion holds for each splat.
     """
 
     means: tuple[float, float] = (2.5e-4, 5e-6)
@@ -176,6 +177,7 @@ class OptimizerOptions:
     sh: tuple[float, float] = (2.5e-3, 1e-3)
     planes: tuple[float, float] = (8e-3, 5e-4)
     network: tuple[float, float] = (8e-4, 1e-4)
+    embeddings: tuple[float, float] = (5e-3, 2e-3)
 
     def __post_init__(self) -> None:
         for rate in fields(self):

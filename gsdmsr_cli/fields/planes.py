@@ -61,24 +61,39 @@ def new_level(resolution: int, times: int, channels: int, generator: torch.Gener
     return Level(space * 0.4 + 0.1, torch.ones(3, chunks, times, resolution, LANES))
 
 
-def lookup(levels: Sequence[Level], points: Tensor, time: float, box: Box = CUBE) -> Tensor:
+def lookup(
+    levels: Sequence[Level],
+    points: Tensor,
+    time: float,
+    box: Box = CUBE,
+    beside: Tensor | None = None,
+) -> Tensor:
     """Return the features (N, sum of channels) of points (N, 3) in the box that the grid fills.
 
     Each level gives the product of six samples; levels are concatenated. The time is in [-1, 1].
-    Coordinates outside are clamped to the border and pass no gradient.
+    Coordinates outside are clamped to the border and pass no gradient. Features (N, K) that the
+    points bring along, ``beside``, become the last columns.
     """
     tensors = [tensor for level in levels for tensor in level]
-    if has_kernels(points, *tensors):
-        features: Tensor = _Lookup.apply(points.contiguous(), time, box, *tensors)
+    own = points.new_empty(len(points), 0) if beside is None else beside
+    if has_kernels(points, own, *tensors):
+        features: Tensor = _Lookup.apply(points.contiguous(), own, time, box, *tensors)
         return features
-    return lookup_twin(levels, points, time, box)
+    return lookup_twin(levels, points, time, box, own)
 
 
-def lookup_twin(levels: Sequence[Level], points: Tensor, time: float, box: Box = CUBE) -> Tensor:
+def lookup_twin(
+    levels: Sequence[Level],
+    points: Tensor,
+    time: float,
+    box: Box = CUBE,
+    beside: Tensor | None = None,
+) -> Tensor:
     """Return what ``lookup`` does, in plain torch, for any device and dtype."""
     scale, shift = points.new_tensor(_to_cube(box))
     places, when = points * scale + shift, points.new_tensor(time)
-    return torch.cat([_sample_level(level, places, when) for level in levels], dim=1)
+    features = [_sample_level(level, places, when) for level in levels]
+    return torch.cat(features if beside is None else [*features, beside], dim=1)
 
 
 def _to_cube(box: Box) -> NDArray[np.float64]:
@@ -115,10 +130,14 @@ class _Lookup(Function):
     """All levels at one time, written side by side into one array of features."""
 
     @staticmethod
-    def forward(ctx: Any, points: Tensor, time: float, box: Box, *tensors: Tensor) -> Tensor:
+    def forward(
+        ctx: Any, points: Tensor, beside: Tensor, time: float, box: Box, *tensors: Tensor
+    ) -> Tensor:
         spaces, times = (tuple(map(array, part)) for part in (tensors[::2], tensors[1::2]))
         lines = tuple(np.empty(plane.shape[:2] + plane.shape[3:], np.float32) for plane in times)
-        features = torch.empty(len(points), sum(plane.shape[1] * LANES for plane in spaces))
+        ctx.columns = sum(plane.shape[1] * LANES for plane in spaces)
+        features = torch.empty(len(points), ctx.columns + beside.shape[1])
+        features[:, ctx.columns :] = beside
         where = array(points), _to_cube(box).astype(np.float32), time
         kernels.lookup(*where, spaces, times, lines, array(features))
         ctx.where, ctx.spaces, ctx.lines = where, spaces, lines
@@ -132,13 +151,14 @@ class _Lookup(Function):
         wanted = ctx.needs_input_grad[0]
         d_points = torch.empty_like(points) if wanted else torch.empty(0, 3)
         gradients = [torch.empty_like(tensor) for tensor in tensors]
-        shares = np.empty((d_features.shape[1] // LANES, len(d_points), 3), np.float32)
+        shares = np.empty((ctx.columns // LANES, len(d_points), 3), np.float32)
         kernels.lookup_backward(
             *ctx.where, ctx.spaces, ctx.lines, array(d_features.contiguous()),
             tuple(map(array, gradients[::2])), tuple(map(array, gradients[1::2])),
             tuple(map(np.empty_like, ctx.lines)), shares, array(d_points),
         )  # fmt: skip
-        return d_points if wanted else None, None, None, *gradients
+        d_beside = d_features[:, ctx.columns :] if ctx.needs_input_grad[1] else None
+        return d_points if wanted else None, d_beside, None, None, *gradients
 
 
 def penalty(

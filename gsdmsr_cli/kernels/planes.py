@@ -85,7 +85,7 @@ def lookup(points, box, time, spaces, times, lines, features):
         points: positions; times ``box[0]`` plus ``box[1]`` (2, 3) they lie in [-1, 1].
         spaces, times: the planes, one array per level.
         lines: one array (3, chunks, R, 16) per level, out: the temporal planes at ``time``.
-        features: out, the levels side by side.
+        features: out, the levels side by side; columns beyond theirs are left as they are.
     """
     n, out, width = points.shape[0], features.reshape(-1), features.shape[1]
     for level in range(len(spaces)):
@@ -147,14 +147,14 @@ def lookup_backward(
 
     Args:
         points, box, time, spaces, lines: see ``lookup``.
-        d_features: (N, C) of all levels side by side.
+        d_features: (N, C or more) of all levels side by side.
         d_spaces, d_times: out, one array per level.
         d_lines: room for the gradients of ``lines``.
         shares: (C / 16, N, 3) room for what each chunk adds to ``d_points``.
         d_points: (N, 3) out, or (0, 3) if not wanted.
     """
     n, width, d_out = points.shape[0], d_features.shape[1], d_features.reshape(-1)
-    for task in prange(width // _LANES):
+    for task in prange(shares.shape[0]):
         level, before = 0, 0
         while task >= before + spaces[level].shape[1]:
             before += spaces[level].shape[1]

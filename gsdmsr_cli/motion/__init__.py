@@ -58,8 +58,8 @@ class Motion(Protocol):
     def groups(self) -> dict[str, str]:
         """Return, for every trained tensor, which of the preset's learning rates it follows.
 
-        "planes" or "network" where all splats share it; the name of a splat's tensor, such as
-        "means", where it has a row for each of them.
+        "planes" or "network" where all splats share it; "embeddings" or the name of a splat's
+        tensor, such as "means", where it has a row for each of them.
         """
 
 

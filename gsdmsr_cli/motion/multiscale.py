@@ -3,6 +3,9 @@
 The coarse field moves positions only, through a linear decoder; the fine one moves positions,
 rotations and scales through a network with a shared trunk, which also sees the coarse features
 (the cross-scale pyramid). Both start as zero, so the motion starts as the identity.
+
+Beyond the method, every splat has features of its own for the fine decoder (E-D3DGS, Bae et al.
+2024): neighbours that part later need no grid fine enough to tell them apart.
 """
 
 from __future__ import annotations
@@ -16,6 +19,8 @@ from gsdmsr_cli.fields import network, planes
 from gsdmsr_cli.fields.deformation import OUTPUTS, displace, name_tensors, time_nodes, trained
 from gsdmsr_cli.motion import Facts
 from gsdmsr_cli.splats import Splats
+
+_EMBEDDINGS = "embeddings"
 
 
 @dataclass(frozen=True)
@@ -32,6 +37,7 @@ class Options:
         time_ratio: the fine grid's nodes in time per distinct train time.
         width: width of the decoder's two hidden layers, a multiple of 16.
         pyramid: give the coarse features to the fine decoder as well.
+        embedding: features of its own that each splat has, a multiple of 16; 0 as in the method.
         detach: keep the fields' gradient from the canonical positions.
         offset_weight: weight of the mean squared coarse offset, in units of the bound.
         space_smoothness, time_smoothness, time_stillness: weights of the plane regularisers.
@@ -46,6 +52,7 @@ class Options:
     time_ratio: float = 0.2
     width: int = 32
     pyramid: bool = True
+    embedding: int = 16
     detach: bool = False
     offset_weight: float = 1e-3
     space_smoothness: float = 1e-4
@@ -56,7 +63,9 @@ class Options:
 class MultiscaleMotion:
     """x + coarse + fine offset, q + fine offset, log s + fine offset (the method's section 3)."""
 
-    def __init__(self, options: Options, facts: Facts, generator: torch.Generator) -> None:
+    def __init__(
+        self, options: Options, facts: Facts, count: int, generator: torch.Generator
+    ) -> None:
         self.options, self.facts = options, facts
         self.fine_active = False
         coarse_times = time_nodes(facts.frames, options.coarse_time_ratio)
@@ -75,20 +84,22 @@ class MultiscaleMotion:
             trained(planes.new_level(resolution, times, options.channels, generator))
             for resolution in options.levels
         ]
-        features = options.channels * len(options.levels)
+        features = options.channels * len(options.levels) + options.embedding
         features += options.coarse_channels if options.pyramid else 0
         widths = [features, options.width, options.width, OUTPUTS]
         self.decoder = [trained(layer) for layer in network.new_network(widths, generator)]
+        self.embeddings = torch.nn.Parameter(torch.zeros(count, options.embedding))
 
     def at(self, splats: Splats, time: float) -> Splats:
         """Return the deformed splats; time is mapped to the whole grids, [-1, 1].
 
         All grids are read in one go, the coarse one first: its decoder reads those columns only.
         """
-        features = self._features(self.coarse + self._active(), splats, time)
         if not self.fine_active:
+            features = self._features(self.coarse, splats, time)
             offset = network.apply_network(self.coarse_decoder, features)
             return replace(splats, means=splats.means + offset)
+        features = self._features(self.coarse + self.fine, splats, time, self.embeddings)
         if self.options.pyramid:
             decoders = [self.coarse_decoder, self.decoder]
             offset, deformation = network.apply_networks(decoders, features)
@@ -101,12 +112,19 @@ class MultiscaleMotion:
     def _active(self) -> list[planes.Level]:
         return self.fine if self.fine_active else []
 
-    def _features(self, levels: list[planes.Level], splats: Splats, time: float) -> Tensor:
+    def _features(
+        self,
+        levels: list[planes.Level],
+        splats: Splats,
+        time: float,
+        embeddings: Tensor | None = None,
+    ) -> Tensor:
         points = splats.means.detach() if self.options.detach else splats.means
-        return planes.lookup(levels, points, 2 * time - 1, self.facts.box)
+        return planes.lookup(levels, points, 2 * time - 1, self.facts.box, embeddings)
 
     def take(self, rows: Tensor) -> None:
-        """Hold nothing per splat."""
+        """Resize the splats' own features."""
+        self.embeddings = torch.nn.Parameter(self.embeddings.detach()[rows])
 
     def advance(self, progress: float) -> None:
         """Let the fine field join after ``coarse_until``."""
@@ -124,19 +142,26 @@ class MultiscaleMotion:
         return value
 
     def tensors(self) -> dict[str, Tensor]:
-        """Return both grids and both decoders."""
-        return name_tensors(
+        """Return both grids, both decoders and, if there are any, the splats' own features."""
+        shared = name_tensors(
             {"coarse": self.coarse, "fine": self.fine},
             {"coarse_decoder": self.coarse_decoder, "decoder": self.decoder},
         )
+        return shared | ({_EMBEDDINGS: self.embeddings} if self.options.embedding else {})
 
     def groups(self) -> dict[str, str]:
         """Return which learning rate each tensor follows."""
-        return {n: "network" if "decoder" in n else "planes" for n in self.tensors()}
+        return {name: _group(name) for name in self.tensors()}
+
+
+def _group(name: str) -> str:
+    if name == _EMBEDDINGS:
+        return "embeddings"
+    return "network" if "decoder" in name else "planes"
 
 
 def start(
     options: Options, facts: Facts, count: int, generator: torch.Generator
 ) -> MultiscaleMotion:
     """Return a motion that is the identity until its decoders' last layers have learnt."""
-    return MultiscaleMotion(options, facts, generator)
+    return MultiscaleMotion(options, facts, count, generator)

@@ -170,7 +170,7 @@ class Trainer:
         p = (progress - static) / (1 - static) if static < 1 else 0.0
         groups = {
             group: log_linear(getattr(options, group), p)
-            for group in (*_PER_SPLAT, "planes", "network")
+            for group in (*_PER_SPLAT, "planes", "network", "embeddings")
         }
         groups["means"] *= self.radius
         rates = {STORED_AS + name: groups[name] for name in _PER_SPLAT}

@@ -123,6 +123,21 @@ def test_a_box_is_stretched_to_the_cube(look: Any) -> None:
         assert_near(a.grad, b.grad, 1e-3, "gradient")
 
 
+@pytest.mark.parametrize("count", [1, 40])
+def test_features_that_points_bring_along_are_the_last_columns(count: int) -> None:
+    start = [points_of(count), torch.randn(count, 16), *tensors_of([(5, 4, 16), (3, 2, 32)])]
+    ours, exact = leaves(start, torch.float32), leaves(start, torch.float64)
+    found = planes.lookup(levels_of(ours[2:]), ours[0], 0.3, planes.CUBE, ours[1])
+    truth = planes.lookup_twin(levels_of(exact[2:]), exact[0], 0.3, planes.CUBE, exact[1])
+    assert torch.equal(found[:, 48:], ours[1])
+    weights = torch.randn(found.shape, generator=generator(1))
+    (found * weights).sum().backward()
+    (truth * weights).sum().backward()
+    assert_near(found, truth, 1e-5, "features")
+    for i, (a, b) in enumerate(zip(ours, exact, strict=True)):
+        assert_near(a.grad, b.grad, 1e-4, f"gradient {i}")
+
+
 @pytest.mark.parametrize("look", [planes.lookup, planes.lookup_twin])
 def test_no_points_have_no_features_and_give_no_gradient(look: Any) -> None:
     tensors = leaves(tensors_of([(3, 4, 16), (5, 2, 32)]), torch.float32)

@@ -233,6 +233,15 @@ def test_multiscale_without_the_pyramid_gives_the_decoder_fewer_inputs() -> None
     assert inputs[0] - inputs[1] == 16
 
 
+def test_multiscale_as_in_the_method_holds_nothing_per_splat() -> None:
+    motion = disturbed(started("multiscale", COUNT, embedding=0))
+    assert not {"embeddings"} & {*motion.tensors(), *motion.groups().values()}
+    splats, rows = splats_of(COUNT), torch.tensor([0, 2])
+    expected = motion.at(splats, 0.3).take(rows)
+    motion.take(rows)
+    assert_equal(motion.at(splats.take(rows), 0.3), expected, atol=1e-6, rtol=1e-6)
+
+
 @pytest.mark.parametrize(("frames", "nodes"), [(2, 8), (100, 25), (150, 38)])
 def test_the_time_grid_follows_from_the_frames(frames: int, nodes: int) -> None:
     facts = motions.Facts(1.0, CUBE, frames)
