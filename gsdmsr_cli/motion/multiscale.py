@@ -109,9 +109,6 @@ class MultiscaleMotion:
             deformation = network.apply_network(self.decoder, fine)
         return displace(splats, deformation, offset)
 
-    def _active(self) -> list[planes.Level]:
-        return self.fine if self.fine_active else []
-
     def _features(
         self,
         levels: list[planes.Level],
@@ -133,7 +130,7 @@ class MultiscaleMotion:
     def penalty(self, splats: Splats, time: float) -> Tensor | None:
         """Return the plane regularisers of the active grids, and L_reg of the coarse offset."""
         o = self.options
-        levels = self.coarse + self._active()
+        levels = self.coarse + self.fine if self.fine_active else self.coarse
         value = planes.penalty(levels, o.space_smoothness, o.time_smoothness, o.time_stillness)
         if o.offset_weight > 0:
             features = self._features(self.coarse, splats, time)

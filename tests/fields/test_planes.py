@@ -193,7 +193,10 @@ def test_time_collapses_linearly_and_spreads_as_the_adjoint(
     for place in chunks:
         kernels.collapse(grid, np.float32(time), lines, *place)
     weights = hats(torch.tensor([time], dtype=torch.float64), moments)[0].numpy()
-    np.testing.assert_allclose(lines, np.einsum("t,actrk->acrk", weights, grid), atol=1e-5)
+    # the place in time is rounded twice, its error counts as the steepest slope; so is the result
+    slope, largest = np.abs(np.diff(grid, axis=2)).max(), np.abs(grid).max()
+    rounding = np.finfo(np.float32).eps * ((moments - 1) * slope + 2 * largest)
+    np.testing.assert_allclose(lines, np.einsum("t,actrk->acrk", weights, grid), atol=rounding)
     d_lines = rng.normal(size=lines.shape).astype(np.float32)
     for place in chunks:
         kernels.spread(d_lines, np.float32(time), d_grid, *place)
