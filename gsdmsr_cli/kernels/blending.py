@@ -18,6 +18,7 @@ from numba import float32, prange
 
 from gsdmsr_cli.kernels import simd
 from gsdmsr_cli.kernels.jit import inline, parallel
+from gsdmsr_cli.kernels.photometric import distances, load_target
 from gsdmsr_cli.splatting_constants import ALPHA_MAX, ALPHA_MIN, TILE, TRANSMITTANCE_STOP
 
 RECORD = 16
@@ -32,7 +33,6 @@ _ALPHA_MIN = float32(ALPHA_MIN)
 _ALPHA_MAX = float32(ALPHA_MAX)
 _STOP = float32(TRANSMITTANCE_STOP)
 _HALF = float32(0.5)
-_SCALE = float32(1 / 255)
 _BLOCK = TILE * TILE
 
 
@@ -273,37 +273,16 @@ def blend_backward(
 
 
 @inline
-def _target_row(pixels, at, inside, row):
-    """Return a tile row of an 8-bit picture in [0, 1], 0 beyond the first ``inside`` pixels."""
-    if inside == TILE:
-        return simd.load_bytes(pixels, at) * _SCALE
-    for x in range(TILE):
-        row[x] = float32(pixels[at + x]) if x < inside else float32(0)
-    return simd.load(row, 0) * _SCALE
-
-
-@inline
-def _columns_below(count):
-    """Return the vector that is 1 in the first ``count`` lanes, else 0."""
-    limit = simd.splat(float32(count) - _HALF)
-    return simd.where_ge(limit, simd.iota(float32(0)), simd.splat(float32(1)))
-
-
-@inline
-def _distance(difference):
-    return simd.maximum(difference, simd.splat(float32(0)) - difference)
-
-
-@inline
 def _compare_plain(row, target, background, top, left, bottom, right):
     """Return the sum of |background - target| over a tile that no splat touches."""
     pixels, width, plane = target.reshape(-1), target.shape[2], target.shape[1] * target.shape[2]
-    total, covered = simd.splat(float32(0)), _columns_below(right - left)
+    total, covered = simd.splat(float32(0)), simd.first_lanes(right - left)
     for channel in range(3):
         shade = covered * background[channel]
         for y in range(top, bottom):
             at = channel * plane + y * width + left
-            total = total + _distance(shade - _target_row(pixels, at, right - left, row))
+            wanted = load_target(pixels, at, right - left, row)
+            total = total + distances(shade - wanted, float32(0))[0]
     return simd.reduce_sum(total)
 
 
@@ -312,8 +291,7 @@ def _compare(block, row, target, background, top, left, bottom, right, weight):
     """Return the sum of |rgb - target| of a drawn tile, and prepare its block for gradients."""
     pixels, width, plane = target.reshape(-1), target.shape[2], target.shape[1] * target.shape[2]
     one, zero = simd.splat(float32(1)), simd.splat(float32(0))
-    up, down, total = simd.splat(weight), simd.splat(-weight), zero
-    covered = _columns_below(right - left)
+    total, covered = zero, simd.first_lanes(right - left)
     for y in range(TILE):
         o, passed, rest = y * TILE, simd.load(block, y * TILE), zero
         colour = simd.load(block, _BLOCK + o)
@@ -321,11 +299,9 @@ def _compare(block, row, target, background, top, left, bottom, right, weight):
             shade, slope = colour + passed * background[channel], zero
             if top + y < bottom:
                 at = channel * plane + (top + y) * width + left
-                target_row = _target_row(pixels, at, right - left, row)
-                difference = shade * covered - target_row
-                total = total + _distance(difference)
-                slope = simd.where_positive(difference, up)
-                slope = slope + simd.where_positive(zero - difference, down)
+                wanted = load_target(pixels, at, right - left, row)
+                distance, slope = distances(shade * covered - wanted, weight)
+                total = total + distance
             rest = rest + slope * shade
             colour = simd.load(block, (2 + channel) * _BLOCK + o)  # its place is taken next
             simd.store(block, (2 + channel) * _BLOCK + o, slope)

@@ -52,26 +52,46 @@ def l1(drawn, target, height, width, weight, gradient, sums):
         sums: (3 * H',) out.
     """
     rows, stride = drawn.shape[1], drawn.shape[2]
+    flat, pixels, out = drawn.reshape(-1), target.reshape(-1), gradient.reshape(-1)
     for task in prange(3 * rows):
         channel, y = task // rows, task % rows
-        total = float32(0)
-        inside = width if y < height else 0
-        for x in range(inside):
-            difference = drawn[channel, y, x] - float32(target[channel, y, x]) * _SCALE
-            total += abs(difference)
-            sign = float32(difference > 0) - float32(difference < 0)
-            gradient[channel, y, x] = weight * sign
-        for x in range(inside, stride):
-            gradient[channel, y, x] = float32(0)
-        sums[task] = total
+        if y >= height:
+            gradient[channel, y] = float32(0)
+            sums[task] = 0
+            continue
+        row, total = np.empty(_LANES, np.float32), simd.splat(float32(0))
+        for x in range(0, stride, _LANES):
+            at, inside = task * stride + x, width - x
+            wanted = load_target(pixels, (channel * height + y) * width + x, inside, row)
+            shown = simd.load(flat, at) * simd.first_lanes(inside)
+            distance, slope = distances(shown - wanted, weight)
+            simd.store(out, at, slope)
+            total = total + distance
+        sums[task] = simd.reduce_sum(total)
 
 
 @inline
-def _inside(x, width):
-    """Return the vector that is 1 in the lanes of columns below ``width``, else 0."""
-    return simd.where_ge(
-        simd.splat(float32(width) - float32(0.5)), simd.iota(float32(x)), simd.splat(float32(1))
-    )
+def load_target(pixels, at, inside, row):
+    """Return 16 values of a flat 8-bit picture in [0, 1], 0 beyond the first ``inside`` of them.
+
+    Args:
+        row: (16,) scratch.
+    """
+    if inside >= _LANES:
+        return simd.load_bytes(pixels, at) * _SCALE
+    for x in range(_LANES):
+        row[x] = float32(pixels[at + x]) if x < inside else float32(0)
+    return simd.load(row, 0) * _SCALE
+
+
+@inline
+def distances(differences, weight):
+    """Return |difference| and weight * sign(difference) of every lane."""
+    zero = simd.splat(float32(0))
+    opposite = zero - differences
+    slopes = simd.where_positive(differences, simd.splat(weight))
+    slopes = slopes - simd.where_positive(opposite, simd.splat(weight))
+    return simd.maximum(differences, opposite), slopes
 
 
 @inline
@@ -113,7 +133,7 @@ def ssim_maps(drawn, target, height, width, maps, sums):
         for y in range(max(top - _REACH, 0), min(bottom + _REACH, height)):
             at = (channel * rows + y) * stride
             for x in range(0, width, _LANES):
-                inside = _inside(x, width)
+                inside = simd.first_lanes(width - x)
                 a, b = simd.load(x_flat, at + x) * inside, simd.load(y_flat, at + x) * inside
                 simd.store(row, _MARGIN + x, a)
                 simd.store(row, pitch + _MARGIN + x, b)
@@ -140,7 +160,7 @@ def ssim_maps(drawn, target, height, width, maps, sums):
                 by_xy = luminance * inverse * two
                 by_x = (my - mx * luminance) * structure * two * inverse1
                 by_x = by_x - mx * by_xx * two - my * by_xy
-                inside = _inside(x, width)
+                inside = simd.first_lanes(width - x)
                 total = total + value * inside
                 o = (channel * rows + y) * stride + x
                 simd.store(out, o, by_x * inside)
@@ -179,7 +199,7 @@ def ssim_gradient(drawn, target, height, width, maps, weight, gradient):
                 c = _blur(across, o + 2 * layer, stride)
                 o = (channel * rows + y) * stride + x
                 d = a + simd.load(x_flat, o) * b * two + simd.load(y_flat, o) * c
-                d = d * weight * _inside(x, width)
+                d = d * weight * simd.first_lanes(width - x)
                 simd.store(out, o, simd.load(out, o) + d)
 
 

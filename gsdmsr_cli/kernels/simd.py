@@ -12,7 +12,7 @@ from collections.abc import Callable
 from typing import Any
 
 from llvmlite import ir
-from numba import carray, types
+from numba import carray, float32, types
 from numba.core import cgutils
 from numba.core.typing.templates import AbstractTemplate, infer_global, signature
 from numba.extending import intrinsic, lower_builtin, models, register_model
@@ -200,6 +200,12 @@ def where_positive(_typing: Any, x: Any, value: Any) -> Any:
         return builder.select(test, args[1], _constant(0.0))
 
     return vector(vector, vector), emit
+
+
+@inline
+def first_lanes(count: int) -> Any:
+    """Return the vector that is 1 in the first ``count`` lanes, any number, and 0 elsewhere."""
+    return where_ge(splat(float32(count) - float32(0.5)), iota(float32(0)), splat(float32(1)))
 
 
 @intrinsic
