@@ -10,7 +10,7 @@ from torch import Tensor
 
 from gsdmsr_cli.errors import DataError
 from gsdmsr_cli.motion import Facts, Motion, start_motion
-from gsdmsr_cli.splats import Splats
+from gsdmsr_cli.splats import NAMES, Splats
 
 STORED_AS = "splats."
 MOVED_BY = "motion."
@@ -43,9 +43,8 @@ class Model:
 
     def per_splat(self) -> list[str]:
         """Return the names of all tensors with one row per splat."""
-        own, groups = self.splats.tensors(), self.motion.groups()
-        held = {"embeddings", *own}
-        return [STORED_AS + name for name in own] + [
+        groups, held = self.motion.groups(), ("embeddings", *NAMES)
+        return [STORED_AS + name for name in NAMES] + [
             MOVED_BY + name for name, group in groups.items() if group in held
         ]
 

@@ -52,7 +52,7 @@ class Splats:
 
     def tensors(self) -> dict[str, Tensor]:
         """Return the five tensors by name, in the order of the attributes."""
-        return {field.name: getattr(self, field.name) for field in fields(self)}
+        return {name: getattr(self, name) for name in NAMES}
 
     def map(self, function: Callable[[Tensor], Tensor]) -> Splats:
         """Return the splats with ``function`` applied to every tensor."""
@@ -65,3 +65,7 @@ class Splats:
     def detach(self) -> Splats:
         """Return the same values outside the autograd graph."""
         return self.map(torch.Tensor.detach)
+
+
+NAMES = tuple(field.name for field in fields(Splats))
+"""The five tensors' names, in the order of the attributes."""

@@ -13,7 +13,7 @@ from gsdmsr_cli.model import Model
 from gsdmsr_cli.motion import Facts, start_motion
 from gsdmsr_cli.raster import best_engine
 from gsdmsr_cli.splatting import draw
-from gsdmsr_cli.training.losses import photometric_loss
+from gsdmsr_cli.training.look import compare
 from gsdmsr_cli.training.optimizer import Adam
 
 TIME = 0.65
@@ -54,9 +54,11 @@ def training_step(size: int, count: int, motion: str) -> Callable[[], None]:
     optimizer, rates = Adam(), dict.fromkeys(model.tensors(), 0.0)
 
     def run() -> None:
-        frame = draw(model, view, TIME, engine, background)
-        frame.means2d.retain_grad()
-        photometric_loss(frame.rgb, target, SSIM_WEIGHT).backward()  # type: ignore[no-untyped-call]
+        _, gradients, _ = compare(
+            engine, model, model.at(TIME), view, background, target, SSIM_WEIGHT
+        )
+        for tensor, gradient in zip(model.tensors().values(), gradients, strict=True):
+            tensor.grad = gradient
         optimizer.step(model.tensors(), rates)
 
     return run

@@ -19,7 +19,7 @@ from gsdmsr_cli.preset import Preset
 from gsdmsr_cli.raster import Engine
 from gsdmsr_cli.run import Checkpoint
 from gsdmsr_cli.scene import Scene, View
-from gsdmsr_cli.splats import Splats
+from gsdmsr_cli.splats import NAMES, Splats
 from gsdmsr_cli.training import averaging
 from gsdmsr_cli.training.density import DensityStatistics, grow_and_prune, reset_opacities
 from gsdmsr_cli.training.initial import initial_splats
@@ -41,7 +41,6 @@ to the box on each side, in units of its edge."""
 PATIENCE = 20
 """Consecutive steps without a finite loss after which training gives up."""
 
-_PER_SPLAT = ("means", "quats", "log_scales", "logit_opacities", "sh")
 _FIRST, _SECOND, _SEEN, _LAST = "adam.first.", "adam.second.", "density.", "last."
 
 
@@ -159,7 +158,7 @@ class Trainer:
         """Start the motion after the static phase, without the momentum of what did not move."""
         if not self._moving and progress >= self.preset.training.static_until:
             self._moving = True
-            for name in _PER_SPLAT:
+            for name in NAMES:
                 self.optimizer.forget(STORED_AS + name, second=False)
         self.model.motion.advance(progress)
 
@@ -170,10 +169,10 @@ class Trainer:
         p = (progress - static) / (1 - static) if static < 1 else 0.0
         groups = {
             group: log_linear(getattr(options, group), p)
-            for group in (*_PER_SPLAT, "planes", "network", "embeddings")
+            for group in (*NAMES, "planes", "network", "embeddings")
         }
         groups["means"] *= self.radius
-        rates = {STORED_AS + name: groups[name] for name in _PER_SPLAT}
+        rates = {STORED_AS + name: groups[name] for name in NAMES}
         moving = self.model.motion.groups()
         return rates | {MOVED_BY + name: groups[group] for name, group in moving.items()}
 
