@@ -1,0 +1,74 @@
+"""What is timed is what it says: gradients of everything, and a step that changes nothing."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+
+from gsdmsr_cli.benchmark import workloads
+from gsdmsr_cli.benchmark.cloud import camera, cloud
+from gsdmsr_cli.raster import best_engine
+from gsdmsr_cli.splats import Splats
+
+
+def test_the_cloud_is_in_the_picture_and_the_same_every_time() -> None:
+    splats = cloud(500)
+    assert all(map(torch.equal, splats.tensors().values(), cloud(500).tensors().values()))
+    assert float(splats.means.norm(dim=1).max()) <= 1 + 1e-6
+    frame = best_engine("cpu").rasterize(splats, camera(64), torch.ones(3))
+    assert float((frame.radii > 0).float().mean()) > 0.95
+    assert 0.2 < float(frame.alpha.mean()) < 0.9
+
+
+def test_drawing_takes_the_gradients_of_all_that_is_stored(monkeypatch: pytest.MonkeyPatch) -> None:
+    drawn: list[Splats] = []
+    engine = best_engine("cpu")
+
+    class Watched:
+        def rasterize(self, splats: Splats, *rest: Any) -> Any:
+            drawn.append(splats)
+            for tensor in splats.tensors().values():
+                tensor.retain_grad()
+                tensor.register_hook(lambda gradient: lengths.append(float(gradient.norm())))
+            return engine.rasterize(splats, *rest)
+
+    lengths: list[float] = []
+    monkeypatch.setattr(workloads, "best_engine", lambda device: Watched())
+    run = workloads.drawing(32, 200)
+    run()
+    assert len(lengths) == 5 and min(lengths) > 0
+    assert all(tensor.grad is None for tensor in drawn[0].tensors().values())
+
+
+@pytest.mark.parametrize("motion", ["hexplane", "multiscale"])
+def test_a_step_takes_all_gradients_and_moves_nothing(
+    motion: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen: list[Any] = []
+    true = workloads.compare
+
+    def remember(engine: Any, model: Any, *rest: Any) -> Any:
+        outcome = true(engine, model, *rest)
+        seen.append((model, {n: t.detach().clone() for n, t in model.tensors().items()}, outcome))
+        return outcome
+
+    monkeypatch.setattr(workloads, "compare", remember)
+    run = workloads.training_step(32, 200, motion)
+    run()
+    run()
+    model, before, (loss, gradients, on_screen) = seen[0]
+    assert loss > 0 and on_screen.shape == (200, 2)
+    for (name, tensor), gradient in zip(model.tensors().items(), gradients, strict=True):
+        assert gradient is not None and gradient.isfinite().all(), name
+        assert torch.equal(tensor, before[name]), name
+        assert tensor.grad is None
+    assert seen[1][2][0] == loss
+
+
+def test_a_target_has_a_loss_at_nearly_every_pixel() -> None:
+    rgb = torch.full((20, 30, 3), 0.5)
+    target = workloads.target_of(rgb)
+    assert (target.dtype, target.shape) == (torch.uint8, (3, 20, 30))
+    assert float((target != 127).float().mean()) > 0.9
