@@ -225,9 +225,46 @@ def kernels(
     as_json: Json = False,
 ) -> None:
     """Time drawing and a training step, forward and backward."""
-    from gsdmsr_cli.commands import benchmark as command
+    from gsdmsr_cli.commands import benchmark_kernels as command
 
     command.run(yardstick, as_json)
+
+
+@benchmark_app.command()
+def scenes(
+    folders: Annotated[list[Path], typer.Argument(metavar="SCENE...", help="Scene folders.")],
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder of the runs and the table.")],
+    preset: Annotated[
+        list[str] | None, typer.Option(metavar="NAME", help="Preset; repeatable.")
+    ] = None,
+    budget: Annotated[
+        list[str] | None, typer.Option(metavar="8m", help="Wall time of a training; repeatable.")
+    ] = None,
+    steps: Annotated[
+        list[int] | None, typer.Option(metavar="N", help="Steps of a training; repeatable.")
+    ] = None,
+    seed: Annotated[list[int] | None, typer.Option(metavar="N", help="Seed; repeatable.")] = None,
+    downscale: Annotated[
+        int, typer.Option(min=1, metavar="N", help="Divide both sides of pictures by N.")
+    ] = 1,
+    background: Annotated[
+        Background, typer.Option(help="Colour behind transparent pixels.")
+    ] = "white",
+    split: Annotated[Literal["test", "val"], typer.Option(help="Views to compare.")] = "test",
+    lpips_weights: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Folder of LPIPS weights.")
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Train presets on scenes at equal lengths and print the table of their scores."""
+    lengths: list[str | int] = [*(budget or []), *(steps or [])]
+    if not lengths:
+        raise UsageError("how long is a training? give --budget 8m or --steps N, or several")
+    from gsdmsr_cli.benchmark.trials import Terms
+    from gsdmsr_cli.commands import benchmark_scenes as command
+
+    terms = Terms(downscale, background, split, lpips_weights)
+    command.run(folders, out, preset or ["dnerf"], lengths, seed or [0], terms, as_json)
 
 
 # The command-line errors of typer share this base, which typer does not export by name.

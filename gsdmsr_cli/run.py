@@ -195,6 +195,14 @@ class Run:
         return model, checkpoint
 
 
+def is_run(root: Path) -> bool:
+    """Tell whether ``root`` holds a run's description, not just any file of its name."""
+    try:
+        return "gsdmsr" in read_json(root / _ABOUT)
+    except DataError:
+        return False
+
+
 def refuse_used(root: Path, overwrite: bool) -> None:
     """Raise DataError unless a run may be started in the folder ``root``."""
     if not root.exists():
@@ -202,7 +210,7 @@ def refuse_used(root: Path, overwrite: bool) -> None:
         return
     if root.is_dir() and not any(root.iterdir()):
         return
-    if not _describes_a_run(root / _ABOUT):
+    if not is_run(root):
         raise DataError(f"{root}: exists and is not a run folder; choose another --out")
     if not overwrite:
         raise DataError(
@@ -277,14 +285,6 @@ def _clear(root: Path) -> None:
             shutil.rmtree(entry)
         else:
             entry.unlink()
-
-
-def _describes_a_run(path: Path) -> bool:
-    """Tell whether ``path`` is a run's description, not just any file of its name."""
-    try:
-        return "gsdmsr" in read_json(path)
-    except DataError:
-        return False
 
 
 def _require_place(root: Path) -> None:

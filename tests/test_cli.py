@@ -14,8 +14,13 @@ import pytest
 import typer
 
 from gsdmsr_cli import __version__, cli, commands
+from gsdmsr_cli.benchmark.trials import Terms
 from gsdmsr_cli.errors import DataError, GsdmsrError, ThresholdError, UsageError
 from gsdmsr_cli.preset import load_preset
+
+COMMANDS = (
+    "train", "eval", "render", "export", "demo", "doctor", "benchmark_kernels", "benchmark_scenes",
+)  # fmt: skip
 
 
 class Gsdmsr:
@@ -25,7 +30,7 @@ class Gsdmsr:
         self.monkeypatch = monkeypatch
         self.calls: list[tuple[str, tuple[Any, ...]]] = []
         self.failure: BaseException | None = None
-        for name in ("train", "eval", "render", "export", "demo", "doctor", "benchmark"):
+        for name in COMMANDS:
             fake = SimpleNamespace(run=lambda *arguments, name=name: self.record(name, arguments))
             monkeypatch.setattr(commands, name, fake, raising=False)
 
@@ -117,7 +122,27 @@ def test_version(gsdmsr: Gsdmsr, capsys: pytest.CaptureFixture[str]) -> None:
         ),
         ("demo", "demo", (Path("gsdmsr-demo"),)),
         ("doctor --json", "doctor", (True,)),
-        ("benchmark kernels --yardstick y --json", "benchmark", (Path("y"), True)),
+        ("benchmark kernels --yardstick y --json", "benchmark_kernels", (Path("y"), True)),
+        (
+            "benchmark scenes a --out o --steps 9",
+            "benchmark_scenes",
+            ([Path("a")], Path("o"), ["dnerf"], [9], [0], Terms(1, "white", "test", None), False),
+        ),
+        (
+            "benchmark scenes a b --out o --preset static --preset dnerf --budget 2m --budget 8m"
+            " --seed 1 --seed 2 --downscale 2 --background black --split val --lpips-weights w"
+            " --json",
+            "benchmark_scenes",
+            (
+                [Path("a"), Path("b")],
+                Path("o"),
+                ["static", "dnerf"],
+                ["2m", "8m"],
+                [1, 2],
+                Terms(2, "black", "val", Path("w")),
+                True,
+            ),
+        ),
     ],
 )
 def test_commands_get_typed_arguments(
@@ -170,6 +195,8 @@ def test_a_budget_without_a_unit_is_refused_as_text(gsdmsr: Gsdmsr) -> None:
         ("export r --format obj --out o", "--format"),
         ("export r --format ply --time 1.5 --out o", "--time"),
         ("benchmark", "missing command"),
+        ("benchmark scenes --out o --steps 3", "SCENE"),
+        ("benchmark scenes a --out o", "--budget 8m or --steps N"),
         ("doctor extra", "extra"),
     ],
 )

@@ -1,0 +1,98 @@
+"""What trials have scored, as a table: a row for each scene, preset and length, and means."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from statistics import fmean
+from typing import Any
+
+from gsdmsr_cli.benchmark.trials import Trial
+
+MEAN = "mean"
+"""What stands for a scene in the rows that average over scenes."""
+
+COLUMNS = {
+    "psnr": ".2f",
+    "spread": ".2f",
+    "train_psnr": ".2f",
+    "ssim": ".4f",
+    "lpips_alex": ".4f",
+    "fps": ".0f",
+    "model_mb": ".2f",
+    "splats": ".0f",
+    "steps": ".0f",
+    "ms_per_step": ".1f",
+}
+"""The measured columns and how they are written; all but the spread are means over seeds."""
+
+Scored = Sequence[tuple[Trial, Mapping[str, Any]]]
+
+
+def rows_of(scored: Scored) -> list[dict[str, Any]]:
+    """Return the rows of trials and their ``metrics.json``.
+
+    The trials of a row differ in their seeds; its ``spread`` is the largest PSNR of them less the
+    smallest, None for a single one. Where there are several scenes, rows follow that average over
+    all of them. A value that any trial lacks is None.
+    """
+    groups: dict[tuple[str | int, str, str], list[dict[str, float | None]]] = {}
+    for trial, document in scored:
+        key = trial.length, trial.preset, trial.scene.resolve().name
+        groups.setdefault(key, []).append(_values(document))
+    rows = [_row(key, values) for key, values in groups.items()]
+    means: dict[tuple[str | int, str], list[dict[str, Any]]] = {}
+    for row in rows:
+        means.setdefault((row["length"], row["preset"]), []).append(row)
+    if len({row["scene"] for row in rows}) > 1:
+        rows += [_row((*key, MEAN), own) | {"spread": None} for key, own in means.items()]
+    return rows
+
+
+def _values(document: Mapping[str, Any]) -> dict[str, float | None]:
+    aggregate, training = document["aggregate"], document["training"]
+    storage = document["storage"]
+    return {
+        "psnr": aggregate["psnr"],
+        "train_psnr": document["aggregate_train"]["psnr"],
+        "ssim": aggregate["ssim"],
+        "lpips_alex": aggregate["lpips_alex"]["value"],
+        "fps": document["speed"]["fps"],
+        "model_mb": (storage["splats_bytes"] + storage["motion_bytes"]) / 1e6,
+        "splats": training["splats"],
+        "steps": training["steps"],
+        "ms_per_step": 1e3 * training["train_s"] / training["steps"],
+    }
+
+
+def _row(
+    key: tuple[str | int, str, str], values: Sequence[Mapping[str, float | None]]
+) -> dict[str, Any]:
+    length, preset, scene = key
+    row: dict[str, Any] = {"scene": scene, "preset": preset, "length": length}
+    row["trials"] = len(values)
+    row["psnr"] = _mean([value["psnr"] for value in values])
+    numbers = [value["psnr"] for value in values if value["psnr"] is not None]
+    row["spread"] = max(numbers) - min(numbers) if len(numbers) > 1 else None
+    for name in COLUMNS:
+        if name not in row:
+            row[name] = _mean([value[name] for value in values])
+    return row
+
+
+def _mean(values: Sequence[float | None]) -> float | None:
+    numbers = [value for value in values if value is not None]
+    return fmean(numbers) if numbers and len(numbers) == len(values) else None
+
+
+def cells(row: Mapping[str, Any]) -> list[str]:
+    """Return the row as texts: scene, preset, length, trials, then ``COLUMNS``."""
+    measured = [(row[name], form) for name, form in COLUMNS.items()]
+    texts = ["" if value is None else format(value, form) for value, form in measured]
+    return [row["scene"], row["preset"], str(row["length"]), str(row["trials"]), *texts]
+
+
+def markdown(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Return the rows as a table in Markdown."""
+    heads = ["scene", "preset", "length", "trials", *COLUMNS]
+    lines = [heads, ["---"] * 3 + ["---:"] * (len(heads) - 3), *map(cells, rows)]
+    return "".join(f"| {' | '.join(line)} |\n" for line in lines)

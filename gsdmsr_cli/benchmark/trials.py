@@ -1,0 +1,159 @@
+"""Trains and evaluates presets on scenes, each trial by the real commands in a process of its own.
+
+A trial's folder is an ordinary run. What an interrupted benchmark has finished is not done again,
+and a training that was cut short goes on from its checkpoint.
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+import subprocess
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from gsdmsr_cli.errors import DataError, GsdmsrError
+from gsdmsr_cli.files import read_json
+from gsdmsr_cli.formats import read_scene
+from gsdmsr_cli.preset import load_preset
+from gsdmsr_cli.run import Run, is_run, open_run
+
+INTERRUPTED = 130
+"""Exit code of a command that Ctrl-C has ended."""
+
+
+@dataclass(frozen=True)
+class Terms:
+    """What all trials have in common.
+
+    Attributes:
+        downscale: both sides of every picture are divided by this.
+        background: "white" or "black".
+        split: the views that are compared, "test" or "val".
+        lpips_weights: folder of weights, or None for the usual places.
+    """
+
+    downscale: int
+    background: str
+    split: str
+    lpips_weights: Path | None
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One preset on one scene.
+
+    Attributes:
+        scene: folder of the scene.
+        preset: name of the preset.
+        length: a budget such as "8m", or a number of steps.
+        seed: of every random choice.
+    """
+
+    scene: Path
+    preset: str
+    length: str | int
+    seed: int
+
+    def folder(self, root: Path) -> Path:
+        """Return the run folder below ``root``."""
+        length = self.length if isinstance(self.length, str) else f"{self.length}steps"
+        return root / self.scene.resolve().name / f"{self.preset}-{length}-{self.seed}"
+
+    def overrides(self, terms: Terms) -> list[str]:
+        """Return what differs from the preset, as ``--set`` takes it."""
+        timed = isinstance(self.length, str)
+        return [
+            f"training.budget={json.dumps(self.length) if timed else 'null'}",
+            *([] if timed else [f"training.steps={self.length}"]),
+            f"training.seed={self.seed}",
+            f"data.downscale={terms.downscale}",
+            f"data.background={terms.background}",
+        ]
+
+
+def all_trials(
+    scenes: Sequence[Path],
+    presets: Sequence[str],
+    lengths: Sequence[str | int],
+    seeds: Sequence[int],
+) -> list[Trial]:
+    """Return every combination, so ordered that a part of them is a table already.
+
+    Raises:
+        DataError: two scenes would share a folder.
+    """
+    names = [scene.resolve().name for scene in scenes]
+    for name in names:
+        if names.count(name) > 1:
+            raise DataError(f"two scenes are called '{name}'; give each folder its own name, once")
+    combined = itertools.product(lengths, seeds, presets, scenes)
+    return [Trial(scene, preset, length, seed) for length, seed, preset, scene in combined]
+
+
+def run_trial(trial: Trial, root: Path, terms: Terms) -> dict[str, Any]:
+    """Return the trial's ``metrics.json``; train and evaluate as far as that is still to do.
+
+    Raises:
+        DataError: the folder holds a training with other options or of other data.
+        GsdmsrError: training or evaluation has failed; its own message stands above.
+        KeyboardInterrupt: Ctrl-C; the training has saved a checkpoint.
+    """
+    folder = trial.folder(root)
+    run = open_run(folder) if is_run(folder) else None
+    if run is not None:
+        _require_same(run, trial, terms)
+    saved = run.load() if run is not None and run.checkpoint_path.is_file() else None
+    if saved is None or saved.progress < 1:
+        settings = [f"--set={override}" for override in trial.overrides(terms)]
+        how = "--overwrite" if saved is None else "--resume"
+        places = ["--data", str(trial.scene), "--out", str(folder)]
+        _gsdmsr("train", *places, "--preset", trial.preset, *settings, how)
+        saved = None
+    report = folder / "eval" / "metrics.json"
+    if saved is None or not _is_report_of(report, saved.step, terms):
+        weights = ["--lpips-weights", str(terms.lpips_weights)] if terms.lpips_weights else []
+        _gsdmsr("eval", str(folder), "--split", terms.split, "--data", str(trial.scene), *weights)
+    return read_json(report)
+
+
+def _require_same(run: Run, trial: Trial, terms: Terms) -> None:
+    if run.preset != load_preset(trial.preset, None, trial.overrides(terms)):
+        raise DataError(
+            f"{run.root}: holds a training with other options than '{trial.preset}' has now; "
+            "choose another --out"
+        )
+    run.check_scene(read_scene(trial.scene))
+
+
+def _is_report_of(path: Path, step: int, terms: Terms) -> bool:
+    """Tell whether ``path`` is a report of the checkpoint at this step on these terms."""
+    if not path.is_file():
+        return False
+    about = read_json(path)["protocol"]
+    found = about["split"], about["background"], about["downscale"]
+    wanted = terms.split, terms.background, terms.downscale
+    return found == wanted and about["checkpoint_step"] == step
+
+
+def _gsdmsr(*arguments: str) -> None:
+    """Run a command of ours; what it shows goes to stderr."""
+    command = [sys.executable, "-m", "gsdmsr_cli.cli", *arguments]
+    process = subprocess.Popen(command, stdout=sys.stderr.fileno())
+    interrupted = False
+    while True:
+        try:
+            code = process.wait()
+            break
+        except KeyboardInterrupt:
+            interrupted = True  # it was sent to the command as well, which saves what it has
+    if interrupted or code == INTERRUPTED:
+        raise KeyboardInterrupt
+    if code:
+        raise GsdmsrError(
+            f"gsdmsr {arguments[0]} has failed with exit code {code}; what is finished stays, and "
+            "the same command goes on from there"
+        )
