@@ -1,8 +1,9 @@
-"""A trained scene: canonical splats and the motion that moves them."""
+"""A trained scene: canonical splats, and the motion of those that move."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -14,39 +15,101 @@ from gsdmsr_cli.splats import NAMES, Splats
 
 STORED_AS = "splats."
 MOVED_BY = "motion."
+STILL = "motion.still"
+"""Under which name ``Model.still`` is saved."""
 
 
 class Model:
-    """N canonical splats and their motion; mutable, since training changes both."""
+    """N canonical splats and the motion of those that move; mutable, since training changes both.
 
-    def __init__(self, splats: Splats, motion: Motion) -> None:
+    Attributes:
+        splats: all of them.
+        motion: holds and moves those that move, in their order.
+        still: (N,) bool, those that stay where they are at all times, and cost no motion.
+    """
+
+    def __init__(self, splats: Splats, motion: Motion, still: Tensor | None = None) -> None:
         self.splats = splats.map(lambda t: torch.nn.Parameter(t.detach().contiguous()))
         self.motion = motion
+        self._let_rest(torch.zeros(len(splats), dtype=torch.bool) if still is None else still)
+
+    def _let_rest(self, still: Tensor) -> None:
+        self.still = still
+        self._moving = (~still).nonzero().flatten()
 
     def at(self, time: float) -> Splats:
         """Return the splats at ``time`` in [0, 1]."""
-        return self.motion.at(self.splats, time)
+        if len(self._moving) == len(self.splats):
+            return self.motion.at(self.splats, time)
+        if not len(self._moving):
+            return self.splats
+        before = self.splats.take(self._moving)
+        after = self.motion.at(before, time).tensors()
+        moved = {
+            name: getattr(self.splats, name).index_copy(0, self._moving, after[name])
+            for name, tensor in before.tensors().items()
+            if after[name] is not tensor  # what the motion leaves alone needs no copy
+        }
+        return replace(self.splats, **moved)
 
-    def take(self, rows: Tensor) -> None:
+    def penalty(self, time: float) -> Tensor | None:
+        """Return the motion's regularisers, looked at for the splats that move at ``time``."""
+        moving = len(self._moving)
+        splats = self.splats if moving == len(self.splats) else self.splats.take(self._moving)
+        return self.motion.penalty(splats, time) if moving else None
+
+    def take(self, rows: Tensor) -> Tensor:
         """Make row i what row ``rows[i]`` was; rows is (M,) int64.
 
         The one resize verb: clone, split, prune and reorder. For every motion
         ``take`` then ``at`` equals ``at`` then ``take``.
+
+        Returns:
+            the rows that ``motion`` has taken; its own count only the splats that move.
         """
+        places = (~self.still).cumsum(0) - 1
+        still = self.still[rows]
+        held = places[rows[~still]]
         self.splats = self.splats.detach().take(rows).map(torch.nn.Parameter)
-        self.motion.take(rows)
+        self.motion.take(held)
+        self._let_rest(still)
+        return held
+
+    def become(self, still: Tensor) -> None:
+        """Take the shapes of a model with such a ``still``; all values must then be set anew."""
+        rows = torch.zeros(len(still), dtype=torch.int64)
+        self.splats = self.splats.detach().take(rows).map(torch.nn.Parameter)
+        self.motion.take(rows[~still])
+        self._let_rest(still)
+
+    @torch.no_grad()
+    def settle(self, still: Tensor, where: Splats) -> Tensor:
+        """Let further splats stand still.
+
+        Args:
+            still: (N,) bool, those that are to stand still; ones that do already may be named.
+            where: N splats, whose values those take that begin to.
+
+        Returns:
+            the rows that ``motion`` has taken, as ``take`` does.
+        """
+        fresh = still & ~self.still
+        for name, tensor in self.splats.tensors().items():
+            tensor[fresh] = getattr(where, name)[fresh]
+        held = (~still[self._moving]).nonzero().flatten()
+        self.motion.take(held)
+        self._let_rest(self.still | still)
+        return held
 
     def tensors(self) -> dict[str, Tensor]:
         """Return everything that is trained and saved, by name."""
         named = {STORED_AS + name: tensor for name, tensor in self.splats.tensors().items()}
         return named | {MOVED_BY + name: t for name, t in self.motion.tensors().items()}
 
-    def per_splat(self) -> list[str]:
-        """Return the names of all tensors with one row per splat."""
-        groups, held = self.motion.groups(), ("embeddings", *NAMES)
-        return [STORED_AS + name for name in NAMES] + [
-            MOVED_BY + name for name, group in groups.items() if group in held
-        ]
+    def held_by_motion(self) -> list[str]:
+        """Return the names of the motion's tensors with one row for each splat that moves."""
+        groups, own = self.motion.groups(), ("embeddings", *NAMES)
+        return [MOVED_BY + name for name, group in groups.items() if group in own]
 
 
 def load_model(
@@ -55,7 +118,8 @@ def load_model(
     """Rebuild a model from its saved tensors.
 
     Args:
-        tensors: what ``Model.tensors`` returned, perhaps among others.
+        tensors: what ``Model.tensors`` returned, and ``STILL`` if any stand still, perhaps among
+            others.
         settings: the motion's name and options.
         facts: the facts the motion was started with.
         progress: how far training had come.
@@ -64,11 +128,16 @@ def load_model(
         DataError: a tensor is missing or has another shape than the settings ask for.
     """
     stored = {k: v for k, v in tensors.items() if k.startswith(STORED_AS)}
+    still = tensors.get(STILL)
     try:
         splats = Splats(**{name.removeprefix(STORED_AS): t for name, t in stored.items()})
     except (TypeError, ValueError) as error:
         raise DataError(f"the checkpoint's splats cannot be used: {error}") from error
-    model = Model(splats, start_motion(settings, facts, len(splats), torch.Generator()))
+    if still is not None and (still.dtype, len(still)) != (torch.bool, len(splats)):
+        raise DataError(f"the checkpoint holds '{STILL}' of {len(still)} rows, not {len(splats)}")
+    moving = len(splats) if still is None else len(splats) - int(still.sum())
+    motion = start_motion(settings, facts, moving, torch.Generator())
+    model = Model(splats, motion, still)
     model.motion.advance(progress)
     with torch.no_grad():
         for name, tensor in model.motion.tensors().items():

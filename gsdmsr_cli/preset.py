@@ -222,6 +222,28 @@ class DensityOptions:
 
 
 @dataclass(frozen=True)
+class SaliencyOptions:
+    """Which splats are spared the motion (GS-DMSR, Lu et al. 2026, section 4.1).
+
+    Attributes:
+        still_from: progress from which splats that hardly move are let stand still, after growing
+            has ended; 1 is never.
+        still_every: interval of looking for them [steps].
+        still_below: motion saliency below which a splat stands still, see
+            ``training.stillness.motion_saliency``.
+    """
+
+    still_from: float = 1.0
+    still_every: int = 500
+    still_below: float = 0.05
+
+    def __post_init__(self) -> None:
+        _require_progress(self, "still_from")
+        _require_at_least(self, 1, "still_every")
+        _require_positive(self, "still_below")
+
+
+@dataclass(frozen=True)
 class Preset:
     """All options of one training run.
 
@@ -235,6 +257,7 @@ class Preset:
     losses: LossOptions = field(default_factory=LossOptions)
     optimizer: OptimizerOptions = field(default_factory=OptimizerOptions)
     density: DensityOptions = field(default_factory=DensityOptions)
+    saliency: SaliencyOptions = field(default_factory=SaliencyOptions)
     motion: dict[str, Any] = field(default_factory=lambda: {"name": "multiscale"})
 
     def __post_init__(self) -> None:

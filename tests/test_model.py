@@ -10,7 +10,8 @@ from torch import Tensor
 from gsdmsr_cli import motion as motions
 from gsdmsr_cli import plugins
 from gsdmsr_cli.errors import DataError
-from gsdmsr_cli.model import Model, load_model
+from gsdmsr_cli.model import STILL, Model, load_model
+from gsdmsr_cli.splats import Splats
 
 COUNT = 9
 
@@ -75,6 +76,98 @@ def test_take_resizes_splats_and_motion_alike(name: str) -> None:
         torch.testing.assert_close(tensor, expected.tensors()[what], atol=1e-6, rtol=1e-6)
     for what, tensor in model.tensors().items():
         assert tensor.is_leaf and tensor.requires_grad and tensor.is_contiguous(), what
+
+
+STILL_ROWS = torch.tensor([False, True, True, False, False, True, False, False, True])
+
+
+def settled(name: str) -> tuple[Model, Splats]:
+    """Return a model of which some splats stand still, and where those are."""
+    model = model_of(name)
+    where = model.at(0.7).map(lambda tensor: tensor.detach().clone())
+    model.settle(STILL_ROWS, where)
+    return model, where
+
+
+@every_motion
+def test_splats_that_stand_still_stay_and_the_others_move_as_before(name: str) -> None:
+    model, where = settled(name)
+    before = model_of(name)
+    for time in (0.0, 0.37, 1.0):
+        moved, unsettled = model.at(time).tensors(), before.at(time).tensors()
+        for what, tensor in moved.items():
+            assert torch.equal(tensor[STILL_ROWS], where.tensors()[what][STILL_ROWS]), what
+            expected = unsettled[what][~STILL_ROWS]
+            torch.testing.assert_close(tensor[~STILL_ROWS], expected, atol=1e-6, rtol=1e-6)
+
+
+@every_motion
+def test_gradients_of_splats_that_stand_still_reach_no_motion(name: str) -> None:
+    model, _ = settled(name)
+    moved = model.at(0.3)
+    parts = [t[STILL_ROWS].square().sum() for t in moved.tensors().values()]
+    torch.stack(parts).sum().backward()
+    for what, tensor in model.splats.tensors().items():
+        assert torch.equal(tensor.grad[STILL_ROWS], 2 * tensor.detach()[STILL_ROWS]), what
+    for what, tensor in model.motion.tensors().items():
+        assert tensor.grad is None or not tensor.grad.any(), what
+
+
+@every_motion
+def test_what_stands_still_follows_a_resize(name: str) -> None:
+    """Rows repeat, are absent and change places, of both kinds."""
+    model, _ = settled(name)
+    rows = torch.tensor([8, 0, 1, 1, 6, 6, 5])
+    expected, names = model.at(0.4).take(rows), model.held_by_motion()
+    held = model.take(rows)
+    assert torch.equal(model.still, STILL_ROWS[rows])
+    assert held.tolist() == [0, 3, 3]  # of the rows 0, 3, 4, 6 and 7, which move
+    for what, tensor in model.at(0.4).tensors().items():
+        torch.testing.assert_close(tensor, expected.tensors()[what], atol=1e-6, rtol=1e-6)
+    for what in names:
+        assert len(model.tensors()[what]) == 3, what
+
+
+@every_motion
+def test_further_splats_can_be_let_stand_still(name: str) -> None:
+    model, first = settled(name)
+    later = model.at(0.2).map(lambda tensor: tensor.detach().clone())
+    further = torch.tensor([True] + 8 * [False])
+    assert model.settle(further, later).tolist() == [1, 2, 3, 4]
+    assert torch.equal(model.still, STILL_ROWS | further)
+    assert torch.equal(model.at(0.9).means[0], later.means[0])
+    model.settle(STILL_ROWS, later)  # those that stand still already stay where they are
+    assert torch.equal(model.at(0.9).means[1], first.means[1])
+
+
+@every_motion
+def test_all_splats_may_stand_still(name: str) -> None:
+    model = model_of(name)
+    model.settle(torch.ones(COUNT, dtype=torch.bool), model.at(0.5))
+    assert torch.equal(model.at(0.1).means, model.at(0.9).means)
+    assert model.penalty(0.5) is None
+    model.take(torch.tensor([3, 3]))
+    assert len(model.at(0.1).means) == 2
+
+
+@every_motion
+def test_who_stands_still_is_saved(name: str) -> None:
+    model, _ = settled(name)
+    loaded = load_model({**saved(model), STILL: model.still}, {"name": name}, FACTS, 1.0)
+    assert torch.equal(loaded.still, model.still)
+    assert torch.equal(loaded.at(0.6).means, model.at(0.6).means)
+    with pytest.raises(DataError, match=r"'motion\.still' of 3 rows, not 9"):
+        load_model({**saved(model), STILL: model.still[:3]}, {"name": name}, FACTS, 1.0)
+
+
+@every_motion
+def test_a_model_takes_the_shapes_of_another(name: str) -> None:
+    model, other = settled(name)[0], model_of(name)
+    model.take(torch.tensor([1, 0, 3, 5]))
+    other.become(model.still)
+    shapes = {what: tensor.shape for what, tensor in model.tensors().items()}
+    assert {what: tensor.shape for what, tensor in other.tensors().items()} == shapes
+    assert len(other.at(0.5)) == 4
 
 
 def test_a_model_has_its_own_contiguous_leaves() -> None:

@@ -25,6 +25,13 @@ OPTIONS = (
 """Every phase of a training within 40 steps: static, coarse, fine; growing, a reset, pruning."""
 
 
+SETTLING = (
+    "density.until=0.4", "saliency.still_from=0.5", "saliency.still_every=5",
+    "optimizer.planes=[0.05,0.01]", "optimizer.network=[0.02,0.002]",
+)  # fmt: skip
+"""A field that learns fast; at half of the steps some splats move and some do not."""
+
+
 def preset_of(*options: str, motion: str = "multiscale") -> Preset:
     return load_preset("dnerf", None, [*OPTIONS, f"motion={{name: {motion}}}", *options])
 

@@ -22,13 +22,16 @@ from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
 from typing import TypeVar
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from gsdmsr_cli.errors import GsdmsrError
 from gsdmsr_cli.kernels import jit
-from gsdmsr_cli.model import Model
+from gsdmsr_cli.model import STORED_AS, Model
 from gsdmsr_cli.scene import View
+from gsdmsr_cli.splats import NAMES
 from gsdmsr_cli.training.look import Look, Observer
 
 T = TypeVar("T")
@@ -41,12 +44,12 @@ class _Task:
     """What a helper is to look at.
 
     Attributes:
-        splats: how many there are now.
+        still: (N,) which of the splats stand still, if that or their number is new, else None.
         views: rows of the team's views.
         progress, moving: see ``Observer.look``.
     """
 
-    splats: int
+    still: NDArray[np.bool_] | None
     views: Sequence[int]
     progress: float
     moving: bool
@@ -131,7 +134,7 @@ class Team:
         if busy:
             self._published.hold(model)
         for helper, share in busy:
-            helper.send(_Task(len(model.splats), share, progress, moving))
+            helper.send(model, share, progress, moving)
         own = [self.observer.look(model, self.views[row], progress, moving) for row in shares[0]]
         other = meanwhile()
         looks = [own] + [helper.looks(model) for helper, _ in busy]
@@ -165,6 +168,7 @@ class _Helper:
     ) -> None:
         self.answers = desk.answers
         self.ready = False
+        self._told: Tensor | None = None
         self.pipe, theirs = multiprocessing.Pipe()
         # a copy of this end in any helper would keep that helper from noticing the training's end
         given = theirs, [*earlier, self.pipe], desk, prepare
@@ -178,10 +182,12 @@ class _Helper:
             self.receive()
             self.ready = True
 
-    def send(self, task: _Task) -> None:
+    def send(self, model: Model, views: Sequence[int], progress: float, moving: bool) -> None:
         self.wait()
+        still = None if model.still is self._told else model.still.numpy()
+        self._told = model.still  # a model never changes it in place
         try:
-            self.pipe.send(task)
+            self.pipe.send(_Task(still, views, progress, moving))
         except OSError as error:
             raise self._has_ended() from error
 
@@ -241,15 +247,13 @@ class _Desk:
     ) -> None:
         self.published, self.answers = published, answers
         self._observer, self._views, self._model = observer, views, model
-        self._reads_published = False
 
     def do(self, task: _Task) -> list[_Answer]:
         """Look at the task's views."""
         model = self._model
-        if len(model.splats) != task.splats or not self._reads_published:
-            model.take(torch.zeros(task.splats, dtype=torch.int64))  # for the shapes alone
+        if task.still is not None:
+            model.become(torch.from_numpy(task.still))
             self.published.lend(model)
-            self._reads_published = True
         model.motion.advance(task.progress)
         return [
             self._answer(
@@ -294,10 +298,11 @@ class _Shelf:
     """Shared memory with a place for each tensor of a model, whatever its number of splats."""
 
     def __init__(self, model: Model, capacity: int, on_screen: bool = False) -> None:
-        splats = len(model.splats)
-        most = {name: math.prod(t.shape) for name, t in model.tensors().items()}
-        for name in model.per_splat():
-            most[name] = most[name] // splats * capacity
+        by_splat = {*model.held_by_motion(), *(STORED_AS + name for name in NAMES)}
+        most = {
+            name: math.prod(t.shape[1:]) * capacity if name in by_splat else t.numel()
+            for name, t in model.tensors().items()
+        }
         if on_screen:
             most[_ON_SCREEN] = 2 * capacity
         self._starts, total = {}, 0

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from gsdmsr_cli.errors import GsdmsrError
 from gsdmsr_cli.fields.planes import Box, Corner
-from gsdmsr_cli.model import MOVED_BY, STORED_AS, Model, load_model
+from gsdmsr_cli.model import MOVED_BY, STILL, STORED_AS, Model, load_model
 from gsdmsr_cli.motion import Facts, start_motion
 from gsdmsr_cli.pictures import Pictures
 from gsdmsr_cli.preset import Preset
@@ -26,6 +26,7 @@ from gsdmsr_cli.training.initial import initial_splats
 from gsdmsr_cli.training.look import Observer
 from gsdmsr_cli.training.optimizer import Adam
 from gsdmsr_cli.training.schedule import log_linear, new_clock
+from gsdmsr_cli.training.stillness import motion_saliency
 from gsdmsr_cli.training.team import Team
 
 PENALTY_EVERY = 4
@@ -122,6 +123,7 @@ class Trainer:
         with self.team.all_threads():
             self.optimizer.step(tensors, self._rates(progress))
         self._control_density(progress)
+        self._settle(progress)
         if self.clock.step % averaging.EVERY == 0:
             self._average(progress)
         return Step(value)
@@ -136,13 +138,14 @@ class Trainer:
         """Return the model that the training has led to: the average where there is one yet."""
         if not self.average.count:
             return self.model
-        return load_model(self.average.tensors, self.preset.motion, self.facts, self.clock.progress)
+        tensors = self.average.tensors | {STILL: self.model.still}
+        return load_model(tensors, self.preset.motion, self.facts, self.clock.progress)
 
     def _penalise(
         self, tensors: Mapping[str, Tensor], view: View
     ) -> tuple[float, Sequence[Tensor | None]]:
         """Return the penalty and its gradients."""
-        penalty = self.model.motion.penalty(self.model.splats, view.time)
+        penalty = self.model.penalty(view.time)
         if penalty is None:
             return 0.0, [None] * len(tensors)
         gradients = torch.autograd.grad(penalty, list(tensors.values()), allow_unused=True)
@@ -188,13 +191,12 @@ class Trainer:
                     f"no splats are left at step {step}; lower density.prune_opacity or check "
                     "that cameras and pictures belong together"
                 )
-            self.model.take(rows)
+            held = self.model.take(rows)
             with torch.no_grad():
                 for name, tensor in self.model.splats.tensors().items():
                     tensor.copy_(getattr(grown, name))
-            names = self.model.per_splat()
-            self.optimizer.take(names, rows, fresh)
-            self.average.take(names, rows)
+            self._follow([STORED_AS + name for name in NAMES], rows, fresh)
+            self._follow(self.model.held_by_motion(), held, fresh[~self.model.still])
             if fresh.any():
                 self.average.forget()
             self.statistics = DensityStatistics(len(rows))
@@ -203,6 +205,23 @@ class Trainer:
             reset_opacities(self.model.splats)
             self.optimizer.forget(STORED_AS + "logit_opacities")
             self.average.forget()
+
+    def _follow(self, names: list[str], rows: Tensor, fresh: Tensor) -> None:
+        """Resize what is kept beside the named tensors of the model."""
+        self.optimizer.take(names, rows, fresh)
+        self.average.take(names, rows)
+
+    def _settle(self, progress: float) -> None:
+        """Let splats stand still that hardly move; not while splats are grown or averaged."""
+        options = self.preset.saliency
+        first = max(options.still_from, self.preset.density.until)
+        if not first <= progress < self.preset.training.average_from:
+            return
+        if self.clock.step % options.still_every == 0:
+            saliency, mean = motion_saliency(self.model)
+            held = self.model.settle(saliency < options.still_below, mean)
+            none = torch.zeros(len(held), dtype=torch.bool)
+            self._follow(self.model.held_by_motion(), held, none)
 
     def _skip(self) -> Step:
         """Drop a step whose loss is not finite; give up after many in a row."""
@@ -222,6 +241,8 @@ class Trainer:
         if self.average.count:
             tensors = {_LAST + name: tensor for name, tensor in tensors.items()}
             tensors |= self.average.tensors
+        if self.model.still.any():
+            tensors[STILL] = self.model.still
         tensors |= {_FIRST + name: t for name, t in self.optimizer.first.items()}
         tensors |= {_SECOND + name: t for name, t in self.optimizer.second.items()}
         tensors[_SEEN + "total"] = self.statistics.total
@@ -246,6 +267,7 @@ class Trainer:
         if self.average.count:
             last = {n.removeprefix(_LAST): t for n, t in tensors.items() if n.startswith(_LAST)}
             self.average.tensors = {name: tensors[name] for name in last}
+            last |= {name: tensors[name] for name in (STILL,) if name in tensors}
         self.model = load_model(last, self.preset.motion, self.facts, checkpoint.progress)
         for moments, prefix in ((self.optimizer.first, _FIRST), (self.optimizer.second, _SECOND)):
             moments.update(

@@ -8,7 +8,15 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from training_checks import STEPS, assert_same_tensors, copies, preset_of, run_of, trainer_of
+from training_checks import (
+    SETTLING,
+    STEPS,
+    assert_same_tensors,
+    copies,
+    preset_of,
+    run_of,
+    trainer_of,
+)
 
 from gsdmsr_cli import motion as motions
 from gsdmsr_cli import plugins
@@ -50,6 +58,17 @@ def test_helpers_change_no_result(tiny_scene: Path, motion: str, views: int) -> 
         assert len(helped.team) == 2
         assert [helped.step().loss for _ in range(STEPS)] == losses
     assert len(helped.model.splats) == 200  # it has grown on the way
+    assert_same_tensors(copies(helped.checkpoint().tensors), copies(alone.checkpoint().tensors))
+
+
+@pytest.mark.usefixtures("two_threads")
+def test_helpers_know_who_stands_still(tiny_scene: Path) -> None:
+    options = (*SETTLING, "training.views_per_step=2")
+    alone = trainer_of(tiny_scene, preset_of(*options))
+    losses = [alone.step().loss for _ in range(STEPS)]
+    with hired(tiny_scene, *options) as helped:
+        assert [helped.step().loss for _ in range(STEPS)] == losses
+    assert 0 < int(helped.model.still.sum()) < len(helped.model.splats)
     assert_same_tensors(copies(helped.checkpoint().tensors), copies(alone.checkpoint().tensors))
 
 

@@ -12,6 +12,7 @@ import torch
 from kernel_checks import assert_same_on_threads
 from torch import Tensor
 from training_checks import (
+    SETTLING,
     STEPS,
     assert_same_tensors,
     copies,
@@ -204,6 +205,49 @@ def test_every_view_is_seen_before_any_again(tiny_scene: Path) -> None:
     for names in rounds:
         assert len(set(names)) == 12
     assert rounds[0] != rounds[1]
+
+
+def test_splats_that_hardly_move_are_let_stand_still(tiny_scene: Path) -> None:
+    trainer = trainer_of(tiny_scene, preset_of(*SETTLING))
+    shares = []
+    for _ in range(STEPS):
+        trainer.step()
+        shares.append(float(trainer.model.still.float().mean()))
+    assert shares[: STEPS // 2] == [0.0] * (STEPS // 2)
+    assert 0 < shares[-1] < 1 and shares == sorted(shares)
+    # after step 35, which begins at 0.85, averaging is near and nothing changes any more
+    assert shares[35:] == [shares[35]] * 5
+    moving = int((~trainer.model.still).sum())
+    assert len(trainer.optimizer.first["motion.embeddings"]) == moving
+    assert len(trainer.optimizer.first["splats.means"]) == len(trainer.model.splats)
+    first, last = trainer.model.at(0.0).means, trainer.model.at(1.0).means
+    assert torch.equal((first == last).all(dim=1), trainer.model.still)
+
+
+def test_nothing_stands_still_unless_asked_for(tiny_scene: Path) -> None:
+    trainer = trainer_of(tiny_scene, preset_of())
+    after(trainer, STEPS)
+    assert not trainer.model.still.any()
+    assert not any("still" in name for name in trainer.checkpoint().tensors)
+
+
+def test_a_training_with_still_splats_is_resumed_as_if_never_interrupted(
+    tiny_scene: Path, tmp_path: Path
+) -> None:
+    whole = trainer_of(tiny_scene, preset_of(*SETTLING))
+    losses = after(whole, STEPS)
+    for stop in (26, 37):  # before and while values are averaged
+        first, second = (trainer_of(tiny_scene, preset_of(*SETTLING)) for _ in range(2))
+        after(first, stop)
+        run = run_of(first, tmp_path / str(stop))
+        run.save(first.checkpoint())
+        second.restore(run.load())
+        assert 0 < int(second.model.still.sum()) < len(second.model.splats)
+        assert after(second, STEPS - stop) == losses[stop:]
+        assert_same_tensors(state_of(second), state_of(whole))
+        model, _ = run.load_model()
+        assert torch.equal(model.still, first.model.still)
+        assert torch.equal(model.at(0.3).means, first.result().at(0.3).means)
 
 
 def test_several_views_a_step_are_averaged(tiny_scene: Path) -> None:

@@ -1,0 +1,102 @@
+"""How much splats move, worked out by hand."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from motion_checks import disturbed, splats_of, started
+from torch import Tensor
+
+from gsdmsr_cli.model import Model
+from gsdmsr_cli.splats import Splats
+from gsdmsr_cli.training.stillness import motion_saliency
+
+
+class Known:
+    """A motion of one's own making."""
+
+    def __init__(self, at: object) -> None:
+        self.at = at
+
+    def take(self, rows: Tensor) -> None:
+        """Hold nothing."""
+
+
+def model_of(splats: Splats, at: object) -> Model:
+    return Model(splats, Known(at))  # type: ignore[arg-type]
+
+
+def still_splats(count: int = 3) -> Splats:
+    return replace(splats_of(count), log_scales=torch.full((count, 3), math.log(0.02)))
+
+
+def test_what_stands_still_has_none() -> None:
+    splats = splats_of(6)
+    saliency, mean = motion_saliency(model_of(splats, lambda s, _: s))
+    torch.testing.assert_close(saliency, torch.zeros(6), atol=1e-5, rtol=0)
+    for name, tensor in mean.tensors().items():
+        torch.testing.assert_close(tensor, splats.tensors()[name], atol=1e-6, rtol=1e-6)
+
+
+def test_a_way_counts_in_units_of_the_own_size() -> None:
+    """From -1 to 1 times (0.03, 0.04, 0): at the ends 0.05 from the mean, 2.5 scales of 0.02."""
+    way = torch.tensor([[0.03, 0.04, 0.0], [0.0, 0.0, 0.0], [0.0, 0.003, 0.004]])
+
+    def at(splats: Splats, time: float) -> Splats:
+        return replace(splats, means=splats.means + (2 * time - 1) * way)
+
+    saliency, mean = motion_saliency(model_of(still_splats(), at))
+    torch.testing.assert_close(saliency, torch.tensor([2.5, 0, 0.25]), atol=1e-4, rtol=1e-4)
+    torch.testing.assert_close(mean.means, still_splats().means, atol=1e-6, rtol=0)
+
+
+def test_an_offset_for_all_times_is_no_motion() -> None:
+    def at(splats: Splats, time: float) -> Splats:
+        return replace(splats, means=splats.means + 3)
+
+    saliency, mean = motion_saliency(model_of(still_splats(), at))
+    assert float(saliency.max()) < 1e-3
+    torch.testing.assert_close(mean.means, still_splats().means + 3)
+
+
+def test_growing_counts_as_the_logarithm() -> None:
+    def at(splats: Splats, time: float) -> Splats:
+        growth = torch.tensor([0.0, 0.4, 0.0]) * (2 * time - 1)
+        return replace(splats, log_scales=splats.log_scales + growth)
+
+    saliency, _ = motion_saliency(model_of(still_splats(), at))
+    torch.testing.assert_close(saliency, torch.full((3,), 0.4), atol=1e-5, rtol=0)
+
+
+def test_turning_counts_as_the_angle() -> None:
+    """From -0.3 to 0.3 about z; quaternions of any length and sign."""
+
+    def at(splats: Splats, time: float) -> Splats:
+        half = 0.3 * (2 * time - 1) / 2
+        turn = torch.tensor([math.cos(half), 0.0, 0.0, math.sin(half)])
+        return replace(splats, quats=turn * torch.tensor([[1.0], [7.0], [-2.0]]))
+
+    saliency, _ = motion_saliency(model_of(still_splats(), at))
+    torch.testing.assert_close(saliency, torch.full((3,), 0.3), atol=1e-4, rtol=0)
+
+
+@pytest.mark.parametrize("name", ["logit_opacities", "sh"])
+def test_whatever_else_a_motion_changes_counts_too(name: str) -> None:
+    def at(splats: Splats, time: float) -> Splats:
+        return replace(splats, **{name: splats.tensors()[name] + time})
+
+    saliency, _ = motion_saliency(model_of(still_splats(), at))
+    assert float(saliency.min()) > 0.1
+
+
+def test_who_stands_still_already_has_none() -> None:
+    model = Model(splats_of(5), disturbed(started("multiscale", 5)))
+    saliency, mean = motion_saliency(model)
+    still = saliency <= saliency.median()
+    model.settle(still, mean)
+    again, _ = motion_saliency(model)
+    assert float(again[still].max()) < 1e-5
+    torch.testing.assert_close(again[~still], saliency[~still])
