@@ -114,10 +114,8 @@ class Pictures:
                 f"image {view.image_path} is {width} x {height} px, but its camera is "
                 f"{view.camera.width} x {view.camera.height}; they must agree"
             )
-        pixels = imaging.composite(image, self._background)
-        if self._downscale > 1:
-            pixels = imaging.resize_area(pixels, *self._size(view))
-        return _planes(pixels * 255)
+        size = self._size(view) if self._downscale > 1 else None
+        return _planes(imaging.composite(image, self._background, size) * 255)
 
 
 class HalvedPictures:

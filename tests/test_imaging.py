@@ -174,6 +174,18 @@ def test_composite_repeats_grey_and_leaves_rgb() -> None:
     np.testing.assert_allclose(imaging.composite(rgb, (1, 0, 0)), rgb / 255, atol=1e-6)
 
 
+@pytest.mark.parametrize("channels", [1, 3, 4])
+@pytest.mark.parametrize("size", [(4, 3), (5, 5), (8, 9)])
+def test_composite_and_shrink_is_composite_then_shrink(
+    size: tuple[int, int], channels: int
+) -> None:
+    image = np.random.default_rng(0).integers(0, 256, (9, 8, channels), dtype=np.uint8)
+    expected = imaging.resize_area(imaging.composite(image, (0.2, 1.0, 0.0)), *size)
+    found = imaging.composite(image, (0.2, 1.0, 0.0), size)
+    assert found.shape == (size[1], size[0], 3)
+    np.testing.assert_allclose(found, expected, atol=1e-6)
+
+
 def test_area_resize_is_the_mean_of_blocks() -> None:
     image = np.random.default_rng(2).random((12, 9, 3)).astype(np.float32)
     expected = image.reshape(4, 3, 3, 3, 3).mean((1, 3))
