@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import itertools
 import json
+import signal
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -140,16 +141,19 @@ def _is_report_of(path: Path, step: int, terms: Terms) -> bool:
 
 
 def _gsdmsr(*arguments: str) -> None:
-    """Run a command of ours; what it shows goes to stderr."""
+    """Run a command of ours; what it shows goes to stderr, and Ctrl-C is handed on to it."""
     command = [sys.executable, "-m", "gsdmsr_cli.cli", *arguments]
-    process = subprocess.Popen(command, stdout=sys.stderr.fileno())
+    # In a session of its own, or a terminal would interrupt it as well: a second Ctrl-C, at which
+    # a training no longer waits to save what it has.
+    process = subprocess.Popen(command, stdout=sys.stderr.fileno(), start_new_session=True)
     interrupted = False
     while True:
         try:
             code = process.wait()
             break
         except KeyboardInterrupt:
-            interrupted = True  # it was sent to the command as well, which saves what it has
+            interrupted = True
+            process.send_signal(signal.SIGINT)
     if interrupted or code == INTERRUPTED:
         raise KeyboardInterrupt
     if code:

@@ -228,7 +228,7 @@ def test_ctrl_c_saves_the_training_that_is_under_way(tiny_scene: Path, tmp_path:
     while not (folder / "metrics.jsonl").is_file() and time.monotonic() < deadline:
         assert process.poll() is None, process.communicate()
         time.sleep(0.05)
-    os.killpg(process.pid, signal.SIGINT)  # what a terminal does
+    os.killpg(process.pid, signal.SIGINT)  # as a terminal does, to the processes in front
     _, error = process.communicate(timeout=60)
     assert process.returncode == 130
     assert "interrupted at step" in error
