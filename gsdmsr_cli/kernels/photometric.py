@@ -31,15 +31,16 @@ _SCALE = float32(1 / 255)
 def to_float(target, planes):
     """Write an 8-bit target (3, H, W) as planes (3, H', W') in [0, 1], 0 outside the picture."""
     channels, height, width = target.shape
+    pixels, out, stride = target.reshape(-1), planes.reshape(-1), planes.shape[2]
     for task in prange(channels * planes.shape[1]):
         channel, y = task // planes.shape[1], task % planes.shape[1]
         if y >= height:
             planes[channel, y] = float32(0)
             continue
-        for x in range(width):
-            planes[channel, y, x] = float32(target[channel, y, x]) * _SCALE
-        for x in range(width, planes.shape[2]):
-            planes[channel, y, x] = float32(0)
+        row = np.empty(_LANES, np.float32)
+        for x in range(0, stride, _LANES):
+            values = load_target(pixels, (channel * height + y) * width + x, width - x, row)
+            simd.store(out, task * stride + x, values)
 
 
 @parallel
