@@ -15,6 +15,8 @@ from gsdmsr_cli.splats import NAMES, Splats
 
 STORED_AS = "splats."
 MOVED_BY = "motion."
+STORED = tuple(STORED_AS + name for name in NAMES)
+"""Names of the splats' own tensors, which have a row for each splat."""
 STILL = "motion.still"
 """Under which name ``Model.still`` is saved."""
 
@@ -70,16 +72,17 @@ class Model:
         places = (~self.still).cumsum(0) - 1
         still = self.still[rows]
         held = places[rows[~still]]
-        self.splats = self.splats.detach().take(rows).map(torch.nn.Parameter)
-        self.motion.take(held)
-        self._let_rest(still)
+        self._resize(rows, held, still)
         return held
 
     def become(self, still: Tensor) -> None:
         """Take the shapes of a model with such a ``still``; all values must then be set anew."""
         rows = torch.zeros(len(still), dtype=torch.int64)
+        self._resize(rows, rows[~still], still)
+
+    def _resize(self, rows: Tensor, held: Tensor, still: Tensor) -> None:
         self.splats = self.splats.detach().take(rows).map(torch.nn.Parameter)
-        self.motion.take(rows[~still])
+        self.motion.take(held)
         self._let_rest(still)
 
     @torch.no_grad()

@@ -77,7 +77,7 @@ class Adam:
         adam_steps(by_kernel, multipliers)
         adam_steps_twin(by_twin, multipliers)
 
-    def take(self, names: list[str], rows: Tensor, fresh: Tensor) -> None:
+    def take(self, names: Sequence[str], rows: Tensor, fresh: Tensor) -> None:
         """Follow a resize of the named tensors; rows that are ``fresh`` (M,) start without moments.
 
         The step count is shared by all rows and goes on.

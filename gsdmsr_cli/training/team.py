@@ -29,9 +29,8 @@ from torch import Tensor
 
 from gsdmsr_cli.errors import GsdmsrError
 from gsdmsr_cli.kernels import jit
-from gsdmsr_cli.model import STORED_AS, Model
+from gsdmsr_cli.model import STORED, Model
 from gsdmsr_cli.scene import View
-from gsdmsr_cli.splats import NAMES
 from gsdmsr_cli.training.look import Look, Observer
 
 T = TypeVar("T")
@@ -298,7 +297,7 @@ class _Shelf:
     """Shared memory with a place for each tensor of a model, whatever its number of splats."""
 
     def __init__(self, model: Model, capacity: int, on_screen: bool = False) -> None:
-        by_splat = {*model.held_by_motion(), *(STORED_AS + name for name in NAMES)}
+        by_splat = {*STORED, *model.held_by_motion()}
         most = {
             name: math.prod(t.shape[1:]) * capacity if name in by_splat else t.numel()
             for name, t in model.tensors().items()

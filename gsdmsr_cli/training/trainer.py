@@ -12,7 +12,7 @@ from torch import Tensor
 
 from gsdmsr_cli.errors import GsdmsrError
 from gsdmsr_cli.fields.planes import Box, Corner
-from gsdmsr_cli.model import MOVED_BY, STILL, STORED_AS, Model, load_model
+from gsdmsr_cli.model import MOVED_BY, STILL, STORED, STORED_AS, Model, load_model
 from gsdmsr_cli.motion import Facts, start_motion
 from gsdmsr_cli.pictures import Pictures
 from gsdmsr_cli.preset import Preset
@@ -161,8 +161,8 @@ class Trainer:
         """Start the motion after the static phase, without the momentum of what did not move."""
         if not self._moving and progress >= self.preset.training.static_until:
             self._moving = True
-            for name in NAMES:
-                self.optimizer.forget(STORED_AS + name, second=False)
+            for name in STORED:
+                self.optimizer.forget(name, second=False)
         self.model.motion.advance(progress)
 
     def _rates(self, progress: float) -> dict[str, float]:
@@ -195,7 +195,7 @@ class Trainer:
             with torch.no_grad():
                 for name, tensor in self.model.splats.tensors().items():
                     tensor.copy_(getattr(grown, name))
-            self._follow([STORED_AS + name for name in NAMES], rows, fresh)
+            self._follow(STORED, rows, fresh)
             self._follow(self.model.held_by_motion(), held, fresh[~self.model.still])
             if fresh.any():
                 self.average.forget()
@@ -206,7 +206,7 @@ class Trainer:
             self.optimizer.forget(STORED_AS + "logit_opacities")
             self.average.forget()
 
-    def _follow(self, names: list[str], rows: Tensor, fresh: Tensor) -> None:
+    def _follow(self, names: Sequence[str], rows: Tensor, fresh: Tensor) -> None:
         """Resize what is kept beside the named tensors of the model."""
         self.optimizer.take(names, rows, fresh)
         self.average.take(names, rows)
@@ -267,7 +267,8 @@ class Trainer:
         if self.average.count:
             last = {n.removeprefix(_LAST): t for n, t in tensors.items() if n.startswith(_LAST)}
             self.average.tensors = {name: tensors[name] for name in last}
-            last |= {name: tensors[name] for name in (STILL,) if name in tensors}
+            if STILL in tensors:
+                last[STILL] = tensors[STILL]
         self.model = load_model(last, self.preset.motion, self.facts, checkpoint.progress)
         for moments, prefix in ((self.optimizer.first, _FIRST), (self.optimizer.second, _SECOND)):
             moments.update(
