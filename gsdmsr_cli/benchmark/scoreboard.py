@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from statistics import fmean
 from typing import Any
 
 from gsdmsr_cli.benchmark.trials import Trial
+from gsdmsr_cli.evaluation.protocol import average
 
 MEAN = "mean"
 """What stands for a scene in the rows that average over scenes."""
@@ -24,6 +24,10 @@ COLUMNS = {
     "ms_per_step": ".1f",
 }
 """The measured columns and how they are written; all but the spread are means over seeds."""
+
+HEADS = ("scene", "preset", "length", "trials", *COLUMNS)
+TEXTS = 3
+"""The columns of a table, and how many of them, the first ones, are no numbers."""
 
 Scored = Sequence[tuple[Trial, Mapping[str, Any]]]
 
@@ -68,31 +72,21 @@ def _row(
     key: tuple[str | int, str, str], values: Sequence[Mapping[str, float | None]]
 ) -> dict[str, Any]:
     length, preset, scene = key
-    row: dict[str, Any] = {"scene": scene, "preset": preset, "length": length}
-    row["trials"] = len(values)
-    row["psnr"] = _mean([value["psnr"] for value in values])
+    row = {"scene": scene, "preset": preset, "length": length, "trials": len(values)}
     numbers = [value["psnr"] for value in values if value["psnr"] is not None]
-    row["spread"] = max(numbers) - min(numbers) if len(numbers) > 1 else None
-    for name in COLUMNS:
-        if name not in row:
-            row[name] = _mean([value[name] for value in values])
-    return row
-
-
-def _mean(values: Sequence[float | None]) -> float | None:
-    numbers = [value for value in values if value is not None]
-    return fmean(numbers) if numbers and len(numbers) == len(values) else None
+    spread = max(numbers) - min(numbers) if len(numbers) > 1 else None
+    measured = [{name: value[name] for name in COLUMNS if name != "spread"} for value in values]
+    return row | {"spread": spread} | average(measured)
 
 
 def cells(row: Mapping[str, Any]) -> list[str]:
-    """Return the row as texts: scene, preset, length, trials, then ``COLUMNS``."""
-    measured = [(row[name], form) for name, form in COLUMNS.items()]
-    texts = ["" if value is None else format(value, form) for value, form in measured]
-    return [row["scene"], row["preset"], str(row["length"]), str(row["trials"]), *texts]
+    """Return the row as texts, in the order of ``HEADS``."""
+    values = [(row[name], COLUMNS.get(name, "")) for name in HEADS]
+    return ["" if value is None else format(value, form) for value, form in values]
 
 
 def markdown(rows: Sequence[Mapping[str, Any]]) -> str:
     """Return the rows as a table in Markdown."""
-    heads = ["scene", "preset", "length", "trials", *COLUMNS]
-    lines = [heads, ["---"] * 3 + ["---:"] * (len(heads) - 3), *map(cells, rows)]
+    rule = ["---"] * TEXTS + ["---:"] * (len(HEADS) - TEXTS)
+    lines = [HEADS, rule, *map(cells, rows)]
     return "".join(f"| {' | '.join(line)} |\n" for line in lines)

@@ -11,7 +11,7 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from gsdmsr_cli.benchmark.scoreboard import COLUMNS, cells, markdown, rows_of
+from gsdmsr_cli.benchmark.scoreboard import HEADS, TEXTS, cells, markdown, rows_of
 from gsdmsr_cli.benchmark.trials import Terms, all_trials, run_trial
 from gsdmsr_cli.files import replacing, write_json
 from gsdmsr_cli.formats import read_scene
@@ -78,10 +78,8 @@ def _write(out: Path, rows: Sequence[dict[str, Any]], terms: Terms) -> None:
 def _table(rows: Sequence[dict[str, Any]], terms: Terms) -> Table:
     about = f"{terms.split} split, downscale {terms.downscale}, on {terms.background}"
     table = Table(title=about)
-    for name in ("scene", "preset", "length"):
-        table.add_column(name)
-    for name in ("trials", *COLUMNS):
-        table.add_column(name, justify="right")
+    for place, name in enumerate(HEADS):
+        table.add_column(name, justify="left" if place < TEXTS else "right")
     for row in rows:
         table.add_row(*cells(row))
     return table
