@@ -8,6 +8,8 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch.autograd import Function
+from torch.autograd.function import once_differentiable
 
 from gsdmsr_cli.errors import DataError
 from gsdmsr_cli.motion import Facts, Motion, start_motion
@@ -39,20 +41,31 @@ class Model:
         self.still = still
         self._moving = (~still).nonzero().flatten()
 
-    def at(self, time: float) -> Splats:
-        """Return the splats at ``time`` in [0, 1]."""
+    def at(self, time: float, teachers: Tensor | None = None) -> Splats:
+        """Return the splats at ``time`` in [0, 1].
+
+        Args:
+            teachers: (N,) bool, the splats whose gradients the motion is to learn from; all if
+                None. The others pass theirs to their canonical values alone, as if what the motion
+                adds to them were constant.
+        """
         if len(self._moving) == len(self.splats):
-            return self.motion.at(self.splats, time)
+            return self._move(self.splats, time, teachers)
         if not len(self._moving):
             return self.splats
         before = self.splats.take(self._moving)
-        after = self.motion.at(before, time).tensors()
+        own = None if teachers is None else teachers[self._moving]
+        after = self._move(before, time, own).tensors()
         moved = {
             name: getattr(self.splats, name).index_copy(0, self._moving, after[name])
             for name, tensor in before.tensors().items()
             if after[name] is not tensor  # what the motion leaves alone needs no copy
         }
         return replace(self.splats, **moved)
+
+    def _move(self, splats: Splats, time: float, teachers: Tensor | None) -> Splats:
+        moved = self.motion.at(splats, time)
+        return moved if teachers is None else _spare(splats, moved, teachers)
 
     def penalty(self, time: float) -> Tensor | None:
         """Return the motion's regularisers, looked at for the splats that move at ``time``."""
@@ -113,6 +126,29 @@ class Model:
         """Return the names of the motion's tensors with one row for each splat that moves."""
         groups, own = self.motion.groups(), ("embeddings", *NAMES)
         return [MOVED_BY + name for name, group in groups.items() if group in own]
+
+
+def _spare(before: Splats, after: Splats, teachers: Tensor) -> Splats:
+    """Return ``after``, whose gradients go through the motion in the rows ``teachers`` only."""
+    spared = {
+        name: _Spare.apply(tensor, getattr(after, name), teachers)
+        for name, tensor in before.tensors().items()
+        if getattr(after, name) is not tensor
+    }
+    return replace(after, **spared)
+
+
+class _Spare(Function):
+    @staticmethod
+    def forward(ctx: Any, before: Tensor, after: Tensor, teachers: Tensor) -> Tensor:
+        ctx.teachers = teachers.view(-1, *[1] * (after.dim() - 1))
+        return after.view_as(after)
+
+    @staticmethod
+    @once_differentiable  # type: ignore[untyped-decorator]
+    def backward(ctx: Any, d_after: Tensor) -> tuple[Tensor, Tensor, None]:
+        taught = d_after * ctx.teachers
+        return d_after - taught, taught, None
 
 
 def load_model(

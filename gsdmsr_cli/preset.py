@@ -223,9 +223,22 @@ class DensityOptions:
 
 @dataclass(frozen=True)
 class SaliencyOptions:
-    """Which splats are spared the motion (GS-DMSR, Lu et al. 2026, section 4.1).
+    """Which splats are spared the optimiser and the motion (GS-DMSR, Lu et al. 2026, section 4.1).
 
     Attributes:
+        gate: what becomes of a step of a splat of low saliency: "none" leaves it; "scale" it is
+            multiplied by ``low_rate``; "freeze" it is left out, moments and all; "sparse" it is
+            taken every 8th time.
+        gate_from: progress from which the gate works, once the motion has begun.
+        threshold: saliency above which a splat is high, see ``training.saliency.step_saliency``.
+        release: share of the threshold below which a splat is low; between the two it stays what
+            it is.
+        low_rate: learning rate of low splats in units of the others'.
+        units: "drawn" weighs components by what they do to the picture, "raw" adds them up.
+        smoothing: weight of the past in the mean of a splat's saliency; 0 takes the last step's.
+        hold: least time between two changes of class [steps].
+        grace: time for which new splats are high, and all of them after a reset [steps].
+        field_every: low splats teach the motion's shared fields every so many steps; 1 is always.
         still_from: progress from which splats that hardly move are let stand still, after growing
             has ended; 1 is never.
         still_every: interval of looking for them [steps].
@@ -233,14 +246,27 @@ class SaliencyOptions:
             ``training.stillness.motion_saliency``.
     """
 
+    gate: Literal["none", "scale", "freeze", "sparse"] = "none"
+    gate_from: float = 0.35
+    threshold: float = 1e-3
+    release: float = 0.5
+    low_rate: float = 0.01
+    units: Literal["drawn", "raw"] = "drawn"
+    smoothing: float = 0.9
+    hold: int = 50
+    grace: int = 500
+    field_every: int = 1
     still_from: float = 1.0
     still_every: int = 500
     still_below: float = 0.05
 
     def __post_init__(self) -> None:
-        _require_progress(self, "still_from")
-        _require_at_least(self, 1, "still_every")
-        _require_positive(self, "still_below")
+        _require_progress(self, "gate_from", "still_from")
+        _require_positive(self, "threshold", "low_rate", "still_below")
+        require(self, "release", 0.0 < self.release <= 1.0, "above 0, at most 1")
+        require(self, "smoothing", 0.0 <= self.smoothing < 1.0, "0 or more, below 1")
+        _require_at_least(self, 0, "hold", "grace")
+        _require_at_least(self, 1, "field_every", "still_every")
 
 
 @dataclass(frozen=True)

@@ -195,3 +195,35 @@ def test_another_shape_is_told_with_both_shapes() -> None:
     tensors["splats.quats"] = torch.zeros(COUNT - 1, 4)
     with pytest.raises(DataError, match="quats has shape"):
         load_model(tensors, {"name": "hexplane"}, FACTS, 1.0)
+
+
+@every_motion
+@pytest.mark.parametrize("some_still", [False, True])
+def test_only_teachers_pass_their_gradients_through_the_motion(name: str, some_still: bool) -> None:
+    """The others pass them on to the canonical values alone; the moved values are the same."""
+    model = model_of(name)
+    if some_still:
+        model.settle(torch.arange(COUNT) < 3, model.splats)
+    teachers = torch.arange(COUNT) % 2 == 0
+
+    def gradients(teachers: Tensor | None, rows: Tensor) -> dict[str, Tensor]:
+        """Of a sum of squares over some of the rows."""
+        moved = model.at(0.4, teachers)
+        loss = torch.stack([t[rows].square().sum() for t in moved.tensors().values()]).sum()
+        given = model.tensors()
+        found = torch.autograd.grad(loss, list(given.values()), materialize_grads=True)
+        return dict(zip(given, found, strict=True))
+
+    for what, tensor in model.at(0.4, teachers).tensors().items():
+        assert torch.equal(tensor, getattr(model.at(0.4), what))
+    taught, full = gradients(teachers, teachers), gradients(None, teachers)
+    for what, gradient in full.items():
+        torch.testing.assert_close(taught[what], gradient, atol=1e-5, rtol=1e-5)
+    spared, moved = gradients(teachers, ~teachers), model.at(0.4)
+    for what, gradient in spared.items():
+        if what.startswith("motion."):
+            assert not gradient.any(), what
+        else:
+            own = 2 * getattr(moved, what.removeprefix("splats.")).detach()
+            own[teachers] = 0
+            torch.testing.assert_close(gradient, own, atol=1e-5, rtol=1e-5)

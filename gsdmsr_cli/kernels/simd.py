@@ -202,6 +202,17 @@ def where_positive(_typing: Any, x: Any, value: Any) -> Any:
     return vector(vector, vector), emit
 
 
+@intrinsic
+def where_zero(_typing: Any, x: Any, value: Any, other: Any) -> Any:
+    """Return ``value`` in the lanes where x is 0, and ``other`` elsewhere."""
+
+    def emit(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        test = builder.fcmp_ordered("==", args[0], _constant(0.0))
+        return builder.select(test, args[1], args[2])
+
+    return vector(vector, vector, vector), emit
+
+
 @inline
 def first_lanes(count: int) -> Any:
     """Return the vector that is 1 in the first ``count`` lanes, any number, and 0 elsewhere."""

@@ -47,8 +47,19 @@ class Observer:
         self.background = torch.tensor(BACKGROUNDS[preset.data.background])
         self._halved = HalvedPictures(pictures)
 
-    def look(self, model: Model, view: View, progress: float, moving: bool) -> Look:
+    def look(
+        self,
+        model: Model,
+        view: View,
+        progress: float,
+        moving: bool,
+        teachers: Tensor | None = None,
+    ) -> Look:
         """Return what the view says of the model at a progress in [0, 1].
+
+        Args:
+            moving: whether the splats move yet.
+            teachers: see ``Model.at``.
 
         Raises:
             DataError: the view's picture cannot be read.
@@ -59,7 +70,7 @@ class Observer:
         losses = self.preset.losses
         ssim_weight = losses.ssim if progress < losses.ssim_until else 0.0
         target, degree = pictures.load(view), self._sh_degree(progress)
-        splats = model.at(view.time) if moving else model.splats
+        splats = model.at(view.time, teachers) if moving else model.splats
         loss, gradients, on_screen = compare(
             self.engine, model, splats, camera, self.background, target, ssim_weight, degree
         )

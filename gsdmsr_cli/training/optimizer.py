@@ -10,9 +10,22 @@ import torch
 from torch import Tensor
 
 from gsdmsr_cli.kernels import adam as kernels
-from gsdmsr_cli.tensors import array, has_kernels
+from gsdmsr_cli.tensors import has_kernels
 
 BETA1, BETA2, EPS = 0.9, 0.999, 1e-15
+
+
+class Gate(NamedTuple):
+    """What the rows of a tensor may do in a step.
+
+    Attributes:
+        multipliers: (N,) factor on the step of each row; a row with factor 0 keeps its values and
+            moments untouched.
+        trace: like the tensor, out: the step that each row would have made with factor 1.
+    """
+
+    multipliers: Tensor
+    trace: Tensor
 
 
 class Move(NamedTuple):
@@ -22,6 +35,7 @@ class Move(NamedTuple):
         tensor, gradient, first, second: contiguous, of one shape; the gradient is only read.
         step: the number of the step, from 1.
         rate: learning rate.
+        gate: what its rows may do, if they are gated.
     """
 
     tensor: Tensor
@@ -30,6 +44,7 @@ class Move(NamedTuple):
     second: Tensor
     step: int
     rate: float
+    gate: Gate | None = None
 
 
 class Adam:
@@ -50,15 +65,15 @@ class Adam:
         self,
         tensors: Mapping[str, Tensor],
         rates: Mapping[str, float],
-        multipliers: Tensor | None = None,
+        gates: Mapping[str, Gate] | None = None,
     ) -> None:
         """Move every tensor that has a gradient, and clear the gradient.
 
         Args:
             tensors: the tensors to move, by name.
             rates: the learning rate of each of them.
-            multipliers: (N,) factor on the step of each row, for tensors of N rows; a row with
-                factor 0 keeps its values and moments untouched.
+            gates: what rows may do, of those tensors that are gated; a trace is left as it is
+                where its tensor has no gradient.
         """
         by_kernel: list[Move] = []
         by_twin: list[Move] = []
@@ -72,10 +87,11 @@ class Adam:
             moments = self.first[name], self.second[name]
             gradient = tensor.grad.contiguous()
             moves = by_kernel if has_kernels(tensor) else by_twin
-            moves.append(Move(tensor, gradient, *moments, self.steps[name], rates[name]))
+            gate = (gates or {}).get(name)
+            moves.append(Move(tensor, gradient, *moments, self.steps[name], rates[name], gate))
             tensor.grad = None
-        adam_steps(by_kernel, multipliers)
-        adam_steps_twin(by_twin, multipliers)
+        adam_steps(by_kernel)
+        adam_steps_twin(by_twin)
 
     def take(self, names: Sequence[str], rows: Tensor, fresh: Tensor) -> None:
         """Follow a resize of the named tensors; rows that are ``fresh`` (M,) start without moments.
@@ -89,6 +105,12 @@ class Adam:
                     taken[fresh] = 0
                     moments[name] = taken
 
+    def calm(self, names: Sequence[str], rows: Tensor) -> None:
+        """Take the momentum from the given rows of the named tensors."""
+        for name in names:
+            if name in self.first:
+                self.first[name][rows] = 0
+
     def forget(self, name: str, second: bool = True) -> None:
         """Set the tensor's first moment to zero, and its second unless told otherwise."""
         for moments in (self.first, self.second) if second else (self.first,):
@@ -96,29 +118,30 @@ class Adam:
                 moments[name].zero_()
 
 
-def adam_steps(moves: Sequence[Move], multipliers: Tensor | None) -> None:
+def adam_steps(moves: Sequence[Move]) -> None:
     """Make all the moves in place, by one kernel."""
     if not moves:
         return
-    table, steps = np.empty((len(moves), 6), np.int64), np.empty((len(moves), 2), np.float32)
-    for i, (tensor, gradient, first, second, step, rate) in enumerate(moves):
-        size = tensor.numel()
-        width = 0 if multipliers is None else size // len(tensor)
+    table, steps = np.empty((len(moves), 8), np.int64), np.empty((len(moves), 2), np.float32)
+    for i, (tensor, gradient, first, second, step, rate, gate) in enumerate(moves):
         addresses = (t.data_ptr() for t in (tensor, gradient, first, second))
-        table[i] = *addresses, size, width
+        gated = gate is not None and tensor.numel() > 0
+        width = tensor.numel() // len(tensor) if gated else 0
+        gates = (t.data_ptr() for t in gate) if gate is not None else (0, 0)
+        table[i] = *addresses, tensor.numel(), width, *gates
         steps[i] = rate / (1 - BETA1**step), 1 / (1 - BETA2**step)
-    factors = np.empty(0, np.float32) if multipliers is None else array(multipliers)
-    kernels.adam(table, steps, factors, *map(np.float32, (BETA1, BETA2, EPS)))
+    kernels.adam(table, steps, *map(np.float32, (BETA1, BETA2, EPS)))
 
 
-def adam_steps_twin(moves: Sequence[Move], multipliers: Tensor | None) -> None:
+def adam_steps_twin(moves: Sequence[Move]) -> None:
     """Make all the moves in place, in plain torch, on any device and dtype."""
-    for tensor, gradient, first, second, step, rate in moves:
+    for tensor, gradient, first, second, step, rate, gate in moves:
         m = first * BETA1 + gradient * (1 - BETA1)
         v = second * BETA2 + gradient.square() * (1 - BETA2)
         move = rate / (1 - BETA1**step) * m / ((v / (1 - BETA2**step)).sqrt() + EPS)
-        if multipliers is not None:
-            factor = multipliers.to(tensor.dtype).reshape(-1, *[1] * (tensor.dim() - 1))
+        if gate is not None:
+            gate.trace.copy_(move)
+            factor = gate.multipliers.to(tensor.dtype).reshape(-1, *[1] * (tensor.dim() - 1))
             moved = factor != 0
             move = torch.where(moved, factor * move, 0.0)
             m, v = torch.where(moved, m, first), torch.where(moved, v, second)

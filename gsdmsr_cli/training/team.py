@@ -45,10 +45,12 @@ class _Task:
     Attributes:
         still: (N,) which of the splats stand still, if that or their number is new, else None.
         views: rows of the team's views.
+        teachers: (N,) bool or None, see ``Model.at``.
         progress, moving: see ``Observer.look``.
     """
 
     still: NDArray[np.bool_] | None
+    teachers: NDArray[np.bool_] | None
     views: Sequence[int]
     progress: float
     moving: bool
@@ -117,6 +119,7 @@ class Team:
         rows: Sequence[int],
         progress: float,
         moving: bool,
+        teachers: Tensor | None,
         meanwhile: Callable[[], T],
     ) -> tuple[list[Look], T]:
         """Look at the views of these rows, in this order.
@@ -133,8 +136,11 @@ class Team:
         if busy:
             self._published.hold(model)
         for helper, share in busy:
-            helper.send(model, share, progress, moving)
-        own = [self.observer.look(model, self.views[row], progress, moving) for row in shares[0]]
+            helper.send(model, share, progress, moving, teachers)
+        own = [
+            self.observer.look(model, self.views[row], progress, moving, teachers)
+            for row in shares[0]
+        ]
         other = meanwhile()
         looks = [own] + [helper.looks(model) for helper, _ in busy]
         return [looks[i % len(self)][i // len(self)] for i in range(len(rows))], other
@@ -181,12 +187,20 @@ class _Helper:
             self.receive()
             self.ready = True
 
-    def send(self, model: Model, views: Sequence[int], progress: float, moving: bool) -> None:
+    def send(
+        self,
+        model: Model,
+        views: Sequence[int],
+        progress: float,
+        moving: bool,
+        teachers: Tensor | None,
+    ) -> None:
         self.wait()
         still = None if model.still is self._told else model.still.numpy()
         self._told = model.still  # a model never changes it in place
+        taught = None if teachers is None else teachers.numpy()
         try:
-            self.pipe.send(_Task(still, views, progress, moving))
+            self.pipe.send(_Task(still, taught, views, progress, moving))
         except OSError as error:
             raise self._has_ended() from error
 
@@ -254,12 +268,13 @@ class _Desk:
             model.become(torch.from_numpy(task.still))
             self.published.lend(model)
         model.motion.advance(task.progress)
-        return [
-            self._answer(
-                self._observer.look(model, self._views[row], task.progress, task.moving), shelf
-            )
-            for row, shelf in zip(task.views, self.answers, strict=False)
-        ]
+        teachers = None if task.teachers is None else torch.from_numpy(task.teachers)
+        answers = []
+        for row, shelf in zip(task.views, self.answers, strict=False):
+            view = self._views[row]
+            look = self._observer.look(model, view, task.progress, task.moving, teachers)
+            answers.append(self._answer(look, shelf))
+        return answers
 
     def _answer(self, look: Look, shelf: _Shelf) -> _Answer:
         gradients = dict(zip(self._model.tensors(), look.gradients, strict=True))

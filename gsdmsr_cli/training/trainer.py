@@ -23,8 +23,9 @@ from gsdmsr_cli.splats import NAMES, Splats
 from gsdmsr_cli.training import averaging
 from gsdmsr_cli.training.density import DensityStatistics, grow_and_prune, reset_opacities
 from gsdmsr_cli.training.initial import initial_splats
-from gsdmsr_cli.training.look import Observer
-from gsdmsr_cli.training.optimizer import Adam
+from gsdmsr_cli.training.look import Look, Observer
+from gsdmsr_cli.training.optimizer import Adam, Gate
+from gsdmsr_cli.training.saliency import Saliency, step_saliency
 from gsdmsr_cli.training.schedule import log_linear, new_clock
 from gsdmsr_cli.training.stillness import motion_saliency
 from gsdmsr_cli.training.team import Team
@@ -43,6 +44,7 @@ PATIENCE = 20
 """Consecutive steps without a finite loss after which training gives up."""
 
 _FIRST, _SECOND, _SEEN, _LAST = "adam.first.", "adam.second.", "density.", "last."
+_SALIENCY = "saliency."
 
 
 @dataclass(frozen=True)
@@ -75,6 +77,7 @@ class Trainer:
         motion = start_motion(preset.motion, self.facts, len(splats), self.generator)
         self.model = Model(splats, motion)
         self.optimizer = Adam()
+        self.saliency = Saliency(len(self.model.splats), preset.saliency)
         self.statistics = DensityStatistics(len(self.model.splats))
         self.average = averaging.Average()
         self.clock = new_clock(preset.training)
@@ -100,9 +103,11 @@ class Trainer:
         self._enter_phase(progress)
         rows = [self._next_row() for _ in range(self.preset.training.views_per_step)]
         tensors = self.model.tensors()
+        gated = self._is_gated(progress)
+        teachers = self.saliency.teachers(self.clock.step) if gated else None
         penalised = self._moving and self.clock.step % PENALTY_EVERY == 0
         looks, penalty = self.team.look(
-            self.model, rows, progress, self._moving,
+            self.model, rows, progress, self._moving, teachers,
             lambda: self._penalise(tensors, self.views[rows[0]]) if penalised else None,
         )  # fmt: skip
         value = fmean(look.loss for look in looks)
@@ -120,8 +125,11 @@ class Trainer:
         if progress < self.preset.density.until:
             for look in looks:
                 self.statistics.observe(look.on_screen, *look.size)
+        gates = self._gates(tensors) if gated else {}
         with self.team.all_threads():
-            self.optimizer.step(tensors, self._rates(progress))
+            self.optimizer.step(tensors, self._rates(progress), gates)
+        if gated:
+            self._attend(looks, gates)
         self._control_density(progress)
         self._settle(progress)
         if self.clock.step % averaging.EVERY == 0:
@@ -179,6 +187,28 @@ class Trainer:
         moving = self.model.motion.groups()
         return rates | {MOVED_BY + name: groups[group] for name, group in moving.items()}
 
+    def _is_gated(self, progress: float) -> bool:
+        options = self.preset.saliency
+        return options.gate != "none" and self._moving and progress >= options.gate_from
+
+    def _gates(self, tensors: Mapping[str, Tensor]) -> dict[str, Gate]:
+        """Return what the rows of all tensors with a row per splat may do in this step."""
+        multipliers = self.saliency.multipliers(self.clock.step)
+        by_name = dict.fromkeys(STORED, multipliers)
+        by_name |= dict.fromkeys(self.model.held_by_motion(), multipliers[~self.model.still])
+        return {name: Gate(m, torch.zeros_like(tensors[name])) for name, m in by_name.items()}
+
+    def _attend(self, looks: Sequence[Look], gates: Mapping[str, Gate]) -> None:
+        """Let the saliency follow a step."""
+        steps = {name: gates[STORED_AS + name].trace for name in NAMES}
+        raw = self.preset.saliency.units == "raw"
+        now = step_saliency(self.model.splats, steps, raw)
+        seen = torch.stack([look.on_screen for look in looks]).any(dim=2).any(dim=0)
+        woken = self.saliency.observe(now, seen)
+        if woken.any():  # what they were about to do when they fell asleep is of no use any more
+            self.optimizer.calm(STORED, woken)
+            self.optimizer.calm(self.model.held_by_motion(), woken[~self.model.still])
+
     def _control_density(self, progress: float) -> None:
         options, step = self.preset.density, self.clock.step
         growing = progress < options.until
@@ -200,11 +230,13 @@ class Trainer:
             if fresh.any():
                 self.average.forget()
             self.statistics = DensityStatistics(len(rows))
+            self.saliency.take(rows, fresh)
         if self._resets < len(options.reset_at) and progress >= options.reset_at[self._resets]:
             self._resets += 1
             reset_opacities(self.model.splats)
             self.optimizer.forget(STORED_AS + "logit_opacities")
             self.average.forget()
+            self.saliency.pardon(torch.ones(len(self.model.splats), dtype=torch.bool))
 
     def _follow(self, names: Sequence[str], rows: Tensor, fresh: Tensor) -> None:
         """Resize what is kept beside the named tensors of the model."""
@@ -247,6 +279,7 @@ class Trainer:
         tensors |= {_SECOND + name: t for name, t in self.optimizer.second.items()}
         tensors[_SEEN + "total"] = self.statistics.total
         tensors[_SEEN + "views"] = self.statistics.views
+        tensors |= {_SALIENCY + name: t for name, t in self.saliency.tensors().items()}
         tensors["generator"] = self.generator.get_state()
         state = {
             "queue": self._queue,
@@ -280,6 +313,8 @@ class Trainer:
             tensors[_SEEN + "total"],
             tensors[_SEEN + "views"],
         )
+        kept = {n.removeprefix(_SALIENCY): t for n, t in tensors.items() if n.startswith(_SALIENCY)}
+        self.saliency.restore(kept)
         self.generator.set_state(tensors["generator"])
         self._queue, self._resets = list(state["queue"]), int(state["resets"])
         self._moving = bool(state["moving"])

@@ -16,6 +16,7 @@ from gsdmsr_cli.training.optimizer import (
     BETA2,
     EPS,
     Adam,
+    Gate,
     Move,
     adam_steps,
     adam_steps_twin,
@@ -24,7 +25,11 @@ from gsdmsr_cli.training.optimizer import (
 SHAPES = [(1,), (16,), (7, 3), (33, 4, 3), (5, 4), (100,)]
 STEPS = 6
 
-Steps = Callable[[list[Move], Tensor | None], None]
+Steps = Callable[[list[Move]], None]
+
+
+def gate_of(values: Tensor, multipliers: Tensor | None) -> Gate | None:
+    return None if multipliers is None else Gate(multipliers, torch.empty_like(values))
 
 
 def gradients_of(shape: tuple[int, ...], seed: int = 0) -> list[Tensor]:
@@ -45,8 +50,8 @@ def moved(
     values = start.clone()
     first, second = torch.zeros_like(values), torch.zeros_like(values)
     for step, gradient in enumerate(gradients, start=1):
-        move = Move(values, gradient.to(values.dtype), first, second, step, rate)
-        steps([move], multipliers)
+        gate = gate_of(values, multipliers)
+        steps([Move(values, gradient.to(values.dtype), first, second, step, rate, gate)])
     return values, first, second
 
 
@@ -70,7 +75,8 @@ def test_steps_are_those_of_torch(shape: tuple[int, ...], ones: bool, dtype: tor
     tensor, optimizer = start.to(dtype, copy=True).requires_grad_(), Adam()
     for gradient, rate in zip(gradients, rates, strict=True):
         tensor.grad = gradient.to(dtype)
-        optimizer.step({"x": tensor}, {"x": rate}, torch.ones(shape[0]) if ones else None)
+        gate = gate_of(tensor, torch.ones(shape[0]) if ones else None)
+        optimizer.step({"x": tensor}, {"x": rate}, {"x": gate} if gate else None)
         assert tensor.grad is None
     assert optimizer.steps == {"x": STEPS}
     expected = by_torch(start, gradients, rates)
@@ -82,9 +88,9 @@ def test_steps_are_those_of_torch(shape: tuple[int, ...], ones: bool, dtype: tor
 
 @pytest.mark.parametrize("steps", [adam_steps, adam_steps_twin])
 def test_the_multiplier_scales_the_step_of_its_row(steps: Steps) -> None:
-    start, gradients = torch.zeros(5, 3), gradients_of((5, 3))[:1]
-    factors = torch.tensor([1.0, 0.5, 2.0, 0.0, -1.0])
-    plain, first, second = moved(steps, start, gradients, torch.ones(5))
+    start, gradients = torch.zeros(35, 3), gradients_of((35, 3))[:1]
+    factors = torch.tensor([1.0, 0.5, 2.0, 0.0, -1.0]).repeat(7)
+    plain, first, second = moved(steps, start, gradients, torch.ones(35))
     scaled, first_scaled, second_scaled = moved(steps, start, gradients, factors)
     torch.testing.assert_close(scaled, plain * factors[:, None], atol=1e-9, rtol=1e-6)
     active = factors != 0
@@ -93,16 +99,16 @@ def test_the_multiplier_scales_the_step_of_its_row(steps: Steps) -> None:
 
 
 @pytest.mark.parametrize("steps", [adam_steps, adam_steps_twin])
-@pytest.mark.parametrize("shape", [(6,), (6, 4, 3)], ids=str)
+@pytest.mark.parametrize("shape", [(6,), (6, 4, 3), (54, 3)], ids=str)
 def test_a_row_with_multiplier_0_keeps_every_bit(steps: Steps, shape: tuple[int, ...]) -> None:
     """Even if its gradient is not a number."""
     rng = generator(2)
     values, first, second = (torch.rand(shape, generator=rng) for _ in range(3))
     before = [t.clone() for t in (values, first, second)]
     gradient = torch.randn(shape, generator=rng)
-    factors = torch.tensor([1.0, 0.0, 0.5, 0.0, 1.0, 0.0])
+    factors = torch.tensor([1.0, 0.0, 0.5, 0.0, 1.0, 0.0]).repeat(shape[0] // 6)
     gradient[1], gradient[3] = float("nan"), float("inf")
-    steps([Move(values, gradient, first, second, 3, 0.01)], factors)
+    steps([Move(values, gradient, first, second, 3, 0.01, gate_of(values, factors))])
     skipped = factors == 0
     for now, old in zip((values, first, second), before, strict=True):
         assert torch.equal(now[skipped], old[skipped])
@@ -123,6 +129,19 @@ def test_the_first_step_has_the_length_of_the_rate() -> None:
     start, gradient = torch.zeros(20), gradients_of((20,))[0]
     values = moved(adam_steps, start, [gradient], rate=0.03)[0]
     torch.testing.assert_close(values, -0.03 * gradient.sign(), rtol=1e-5, atol=0)
+
+
+@pytest.mark.parametrize("steps", [adam_steps, adam_steps_twin])
+def test_the_trace_is_the_step_with_multiplier_1(steps: Steps) -> None:
+    rng = generator(5)
+    start, first, second = torch.randn(21, 3, generator=rng), *torch.rand(2, 21, 3, generator=rng)
+    gradient = torch.randn(21, 3, generator=rng)
+    free, gated = start.clone(), start.clone()
+    gate = gate_of(gated, torch.tensor([1.0, 0.0, 0.01]).repeat(7))
+    assert gate is not None
+    for values, its_gate in ((free, None), (gated, gate)):
+        steps([Move(values, gradient, first.clone(), second.clone(), 3, 0.1, its_gate)])
+    torch.testing.assert_close(gate.trace, start - free, atol=2e-7, rtol=1e-5)
 
 
 @pytest.mark.parametrize("rows", [None, torch.full((40,), 0.5)], ids=["flat", "rows"])
@@ -163,6 +182,16 @@ def test_take_follows_the_parents_and_fresh_rows_have_no_moments() -> None:
         assert torch.equal(now["field"], old["field"])
         assert now.keys() == {"splats", "field"}
     assert optimizer.steps == before.steps
+
+
+def test_calm_takes_the_momentum_of_some_rows() -> None:
+    optimizer, before = trained_adam(), trained_adam()
+    rows = torch.tensor([True, False, False, True])
+    optimizer.calm(["splats", "never trained"], rows)
+    assert not optimizer.first["splats"][rows].any()
+    assert torch.equal(optimizer.first["splats"][~rows], before.first["splats"][~rows])
+    assert torch.equal(optimizer.second["splats"], before.second["splats"])
+    assert torch.equal(optimizer.first["field"], before.first["field"])
 
 
 def test_forget_clears_one_tensor() -> None:
