@@ -144,6 +144,7 @@ def lookup_backward(
 
     Every thread owns whole chunks of 16 channels, so that threads never write to one place and
     the sums do not depend on their number. Points outside [-1, 1] get no gradient along that axis.
+    Points whose ``d_features`` are 0 cost next to nothing.
 
     Args:
         points, box, time, spaces, lines: see ``lookup``.
@@ -170,6 +171,11 @@ def lookup_backward(
             d_space[axis, c] = float32(0)
             d_line[axis, c] = float32(0)
         for i in range(n):
+            d = simd.load(d_out, i * width + task * _LANES)
+            if simd.reduce_max(simd.maximum(d, d * float32(-1))) == float32(0):
+                if d_points.shape[0] > 0:
+                    shares[task, i] = float32(0)
+                continue
             px, py, pz = (
                 _in_box(points, box, i, 0),
                 _in_box(points, box, i, 1),
@@ -190,7 +196,6 @@ def lookup_backward(
             s_x, by_x = _linear(strips, x, wx)
             s_y, by_y = _linear(strips, y, wy)
             s_z, by_z = _linear(strips, z, wz)
-            d = simd.load(d_out, i * width + task * _LANES)
             d_time = d * (s_x * s_y * s_z)
             d_xy, d_xz, d_yz = d_time * s_xz * s_yz, d_time * s_xy * s_yz, d_time * s_xy * s_xz
             d = d * (s_xy * s_xz * s_yz)

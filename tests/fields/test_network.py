@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from itertools import pairwise
 
 import pytest
@@ -52,6 +53,21 @@ def test_kernels_match_the_twin(widths: list[int], count: int) -> None:
     (truth * weights).sum().backward()
     for i, (a, b) in enumerate(zip(ours, exact, strict=True)):
         assert_near(a.grad, b.grad, 1e-4, f"gradient {i}")
+
+
+def test_rows_without_a_gradient_are_left_out() -> None:
+    """Whatever they hold: here numbers that would spoil every sum."""
+    for zero in (torch.arange(333) % 3 > 0, torch.arange(333) < 200, torch.ones(333) > 0):
+        x = torch.randn(333, 48, generator=generator(8))
+        spoilt = torch.where(zero[:, None], math.inf, x)
+        results = []
+        for rows, given in ((slice(None), spoilt), (~zero, x)):
+            inputs, *tensors = leaves([given, *tensors_of([32, 16, 10])], torch.float32)
+            y = network.apply_network(layers_of(tensors), inputs)[rows]
+            y.backward(torch.where(zero[rows][:, None], 0.0, 1.0).expand_as(y))
+            results.append([inputs.grad, *(tensor.grad for tensor in tensors)])
+        for ours, truth in zip(*results, strict=True):
+            assert_near(ours, truth, 1e-5, "gradients")
 
 
 def test_networks_side_by_side_are_the_networks_one_by_one() -> None:
