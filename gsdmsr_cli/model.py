@@ -67,11 +67,11 @@ class Model:
         moved = self.motion.at(splats, time)
         return moved if teachers is None else _spare(splats, moved, teachers)
 
-    def penalty(self, time: float) -> Tensor | None:
+    def penalty(self, time: float, generator: torch.Generator) -> Tensor | None:
         """Return the motion's regularisers, looked at for the splats that move at ``time``."""
         moving = len(self._moving)
         splats = self.splats if moving == len(self.splats) else self.splats.take(self._moving)
-        return self.motion.penalty(splats, time) if moving else None
+        return self.motion.penalty(splats, time, generator) if moving else None
 
     def take(self, rows: Tensor) -> Tensor:
         """Make row i what row ``rows[i]`` was; rows is (M,) int64.

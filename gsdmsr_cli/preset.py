@@ -111,6 +111,8 @@ class TrainingOptions:
         budget: length of the training as wall time, such as "8m"; null counts steps.
         static_until: progress up to which nothing moves.
         views_per_step: pictures drawn and compared per step.
+        tiles_per_view: tiles of 16 x 16 px that are chosen of each, once SSIM does not count any
+            more; 0 is all.
         low_resolution_until: progress up to which pictures of half the size are drawn; 0 is never.
         average_from: progress from which the result is the mean of the steps' values; 1 is never.
         checkpoint_minutes: time between checkpoints [min].
@@ -122,6 +124,7 @@ class TrainingOptions:
     budget: str | None = None
     static_until: float = 0.04
     views_per_step: int = 2
+    tiles_per_view: int = 0
     low_resolution_until: float = 0.3
     average_from: float = 0.9
     checkpoint_minutes: float = 2.0
@@ -135,7 +138,7 @@ class TrainingOptions:
         _require_progress(self, "static_until", "low_resolution_until", "average_from")
         _require_positive(self, "checkpoint_minutes")
         require(self, "seed", 0 <= self.seed < 2**32, "0 to 4294967295")
-        _require_at_least(self, 0, "threads")
+        _require_at_least(self, 0, "threads", "tiles_per_view")
 
 
 @dataclass(frozen=True)
@@ -164,7 +167,8 @@ class OptimizerOptions:
         log_scales: of the logarithms of the scales.
         quats: of the rotations.
         logit_opacities: of the logits of the opacities.
-        sh: of the constant colour coefficient.
+        sh: of the colours' coefficients.
+        sh_rest: rate of all coefficients but the constant ones, in units of that; 3DGS has 0.05.
         planes: of the motion's plane grids.
         network: of the motion's networks.
         embeddings: of the features that a motion holds for each splat.
@@ -175,13 +179,16 @@ class OptimizerOptions:
     quats: tuple[float, float] = (1e-3, 5e-4)
     logit_opacities: tuple[float, float] = (0.05, 0.01)
     sh: tuple[float, float] = (2.5e-3, 1e-3)
+    sh_rest: float = 1.0
     planes: tuple[float, float] = (8e-3, 5e-4)
     network: tuple[float, float] = (8e-4, 1e-4)
     embeddings: tuple[float, float] = (5e-3, 2e-3)
 
     def __post_init__(self) -> None:
+        _require_positive(self, "sh_rest")
         for rate in fields(self):
-            ok = min(getattr(self, rate.name)) > 0
+            value = getattr(self, rate.name)
+            ok = rate.name == "sh_rest" or min(value) > 0
             require(self, rate.name, ok, "[start, end], both above 0")
 
 
@@ -238,7 +245,8 @@ class SaliencyOptions:
         smoothing: weight of the past in the mean of a splat's saliency; 0 takes the last step's.
         hold: least time between two changes of class [steps].
         grace: time for which new splats are high, and all of them after a reset [steps].
-        field_every: low splats teach the motion's shared fields every so many steps; 1 is always.
+        field_every: low splats teach the motion's shared fields every so many steps; 1 is always,
+            0 never.
         still_from: progress from which splats that hardly move are let stand still, after growing
             has ended; 1 is never.
         still_every: interval of looking for them [steps].
@@ -265,8 +273,8 @@ class SaliencyOptions:
         _require_positive(self, "threshold", "low_rate", "still_below")
         require(self, "release", 0.0 < self.release <= 1.0, "above 0, at most 1")
         require(self, "smoothing", 0.0 <= self.smoothing < 1.0, "0 or more, below 1")
-        _require_at_least(self, 0, "hold", "grace")
-        _require_at_least(self, 1, "field_every", "still_every")
+        _require_at_least(self, 0, "hold", "grace", "field_every")
+        _require_at_least(self, 1, "still_every")
 
 
 @dataclass(frozen=True)

@@ -23,3 +23,8 @@ FRUSTUM_MARGIN = 1.3
 
 TILE = 16
 """Edge of a tile [px] in engines that have tiles."""
+
+
+def tile_grid(width: int, height: int) -> tuple[int, int]:
+    """Return the rows and columns of tiles that cover a picture; tiles are numbered row by row."""
+    return -(-height // TILE), -(-width // TILE)

@@ -82,7 +82,7 @@ def test_the_example_of_a_motion_keeps_to_the_rules(linear: ModuleType) -> None:
         motion.velocities += torch.arange(15.0).reshape(5, 3)
     moved = motion.at(splats, 1.0)
     torch.testing.assert_close(moved.means, splats.means + 0.5 * motion.velocities)
-    assert motion.penalty(splats, 0.5) > 0
+    assert motion.penalty(splats, 0.5, torch.Generator()) > 0
     rows = torch.tensor([4, 0, 0])
     motion.take(rows)
     assert torch.equal(motion.at(splats.take(rows), 1.0).means, moved.means[rows])

@@ -145,7 +145,7 @@ def test_all_splats_may_stand_still(name: str) -> None:
     model = model_of(name)
     model.settle(torch.ones(COUNT, dtype=torch.bool), model.at(0.5))
     assert torch.equal(model.at(0.1).means, model.at(0.9).means)
-    assert model.penalty(0.5) is None
+    assert model.penalty(0.5, torch.Generator()) is None
     model.take(torch.tensor([3, 3]))
     assert len(model.at(0.1).means) == 2
 

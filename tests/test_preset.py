@@ -36,8 +36,9 @@ def refusal(name: str | None, config: Path | None, *overrides: str) -> str:
     return message
 
 
-def test_the_four_presets_ship() -> None:
-    assert {"default", "dnerf", "hexplane", "static"} <= set(preset_files.preset_names())
+def test_the_presets_ship() -> None:
+    names = {"default", "dnerf", "hexplane", "static", "4dgs", "gsdmsr-literal"}
+    assert names <= set(preset_files.preset_names())
 
 
 @pytest.mark.parametrize("name", preset_files.preset_names())

@@ -54,10 +54,8 @@ def training_step(size: int, count: int, motion: str) -> Callable[[], None]:
     optimizer, rates = Adam(), dict.fromkeys(model.tensors(), 0.0)
 
     def run() -> None:
-        _, gradients, _ = compare(
-            engine, model, model.at(TIME), view, background, target, SSIM_WEIGHT
-        )
-        for tensor, gradient in zip(model.tensors().values(), gradients, strict=True):
+        look = compare(engine, model, model.at(TIME), view, background, target, SSIM_WEIGHT)
+        for tensor, gradient in zip(model.tensors().values(), look.gradients, strict=True):
             tensor.grad = gradient
         optimizer.step(model.tensors(), rates)
 

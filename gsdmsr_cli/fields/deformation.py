@@ -19,8 +19,10 @@ from gsdmsr_cli.tensors import array, has_kernels
 
 Part = TypeVar("Part", Level, Layer)
 
-OUTPUTS = kernels.MEAN + kernels.QUAT + kernels.SCALE
+PARTS = [kernels.MEAN, kernels.QUAT, kernels.SCALE]
 """Columns of a deformation: offsets of the mean (3), the quaternion (4) and the log scales (3)."""
+
+OUTPUTS = sum(PARTS)
 
 
 def displace(splats: Splats, deformation: Tensor, shift: Tensor | None = None) -> Splats:
@@ -28,7 +30,7 @@ def displace(splats: Splats, deformation: Tensor, shift: Tensor | None = None) -
 
     Args:
         splats: N canonical splats.
-        deformation: (N, 10), see ``OUTPUTS``.
+        deformation: (N, 10), see ``PARTS``.
         shift: (N, 3) a further offset of the means.
     """
     further = deformation.new_empty(0, 3) if shift is None else shift
@@ -41,7 +43,7 @@ def displace(splats: Splats, deformation: Tensor, shift: Tensor | None = None) -
 
 def displace_twin(splats: Splats, deformation: Tensor, shift: Tensor | None = None) -> Splats:
     """Return what ``displace`` does, in plain torch, for any device and dtype."""
-    offset, turn, growth = deformation.split([kernels.MEAN, kernels.QUAT, kernels.SCALE], dim=1)
+    offset, turn, growth = deformation.split(PARTS, dim=1)
     return replace(
         splats,
         means=splats.means + offset + (0 if shift is None else shift),

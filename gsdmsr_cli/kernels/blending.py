@@ -24,6 +24,10 @@ from gsdmsr_cli.splatting_constants import ALPHA_MAX, ALPHA_MIN, TILE, TRANSMITT
 RECORD = 16
 """Floats per splat record: one cache line, of which nine are used."""
 
+WEIGHTED = 9
+"""How many of a splat's sums a tile's weight in the loss applies to; the two after them are those
+of e dx and e dy without it."""
+
 PARTS = 4
 """Parts of the picture whose gradients are summed apart, and so the most threads of the backward
 pass. A fixed number: then the sums do not depend on how many threads there are."""
@@ -131,11 +135,12 @@ def _make_differentiate(from_kept: bool) -> Any:
     """Make the gradients of a tile, from falloffs that are kept or computed again."""
 
     @inline
-    def differentiate(block, kept, records, entries, start, end, x0, y0, own):
+    def differentiate(block, kept, records, entries, start, end, x0, y0, tile_weight, own):
         """Add a tile's shares of the gradients of its splats to ``own``.
 
         The block holds the transmittance, 1 at first, what is left of d_rgb . rgb, and d_rgb.
         """
+        factors = simd.first_lanes(WEIGHTED) * (tile_weight - float32(1)) + simd.splat(float32(1))
         one, zero = simd.splat(float32(1)), simd.splat(float32(0))
         cut, full, floor = simd.splat(_ALPHA_MIN), simd.splat(_ALPHA_MAX), simd.splat(float32(-126))
         top, bottom, at = 0, TILE - 1, 0
@@ -177,9 +182,9 @@ def _make_differentiate(from_kept: bool) -> Any:
             sum_ex = sum_e * dx
             shares = simd.reduce_sums(
                 sum_e, sum_ex, sum_ey, sum_ex * dx, sum_ey * dx, sum_eyy,
-                sum_red, sum_green, sum_blue,
+                sum_red, sum_green, sum_blue, sum_ex, sum_ey,
             )  # fmt: skip
-            simd.store(own, i * RECORD, simd.load(own, i * RECORD) + shares)
+            simd.store(own, i * RECORD, simd.load(own, i * RECORD) + shares * factors)
 
     return differentiate
 
@@ -230,12 +235,13 @@ def blend_backward(
     """Sum every splat's share of the gradients over the pixels of each part of the picture.
 
     With e = alpha dL/dalpha of a pixel, the sums are those of e, e dx, e dy, e dx^2, e dx dy,
-    e dy^2 and of weight times d_rgb. Saturated pixels have e = 0.
+    e dy^2 and of weight times d_rgb, then those of e dx and e dy again. Saturated pixels have
+    e = 0.
 
     Args:
         d_rgb: (3, H', W') float32, 0 outside the picture.
         d_alpha: (H', W') float32, 0 outside the picture, or (0, 0) if it is 0 everywhere.
-        sums: (PARTS, N, 16) float32 out, of which nine columns are used.
+        sums: (PARTS, N, 16) float32 out, of which eleven columns are used.
         others: see ``blend``.
     """
     stride = rgb.shape[2]
@@ -269,7 +275,7 @@ def blend_backward(
                 simd.store(block, 2 * _BLOCK + y * TILE, d_red)
                 simd.store(block, 3 * _BLOCK + y * TILE, d_green)
                 simd.store(block, 4 * _BLOCK + y * TILE, d_blue)
-            _differentiate(block, block, records, entries, start, end, x0, y0, own)
+            _differentiate(block, block, records, entries, start, end, x0, y0, float32(1), own)
 
 
 @inline
@@ -311,8 +317,11 @@ def _compare(block, row, target, background, top, left, bottom, right, weight):
 
 
 @parallel
-def blend_l1(records, entries, starts, busiest, columns, background, target, weight, losses, sums):
-    """Draw every tile, compare it with the target and take the gradients while it is at hand.
+def blend_l1(
+    records, entries, starts, busiest, columns, background, target, weight, tile_weights, losses,
+    sums,
+):  # fmt: skip
+    """Draw tiles, compare them with the target and take the gradients while they are at hand.
 
     What ``blend``, ``photometric.l1`` and ``blend_backward`` do one after another, without a
     picture in between.
@@ -320,7 +329,9 @@ def blend_l1(records, entries, starts, busiest, columns, background, target, wei
     Args:
         target: (3, H, W) uint8.
         weight: of each absolute difference in the loss.
-        losses: (tiles,) out, sums of absolute differences.
+        tile_weights: (tiles,) float32, further factors on the loss of each tile; those of weight 0
+            are not drawn. (0,) stands for 1 everywhere.
+        losses: (tiles,) out, sums of absolute differences, without the tiles' weights.
         others: see ``blend`` and ``blend_backward``.
     """
     height, width = target.shape[1], target.shape[2]
@@ -331,6 +342,10 @@ def blend_l1(records, entries, starts, busiest, columns, background, target, wei
         kept = np.empty(0, np.float32)
         for turn in range(part, busiest.shape[0], PARTS):
             tile = busiest[turn]
+            tile_weight = tile_weights[tile] if tile_weights.shape[0] > 0 else float32(1)
+            if tile_weight == float32(0):
+                losses[tile] = 0
+                continue
             tile_y, tile_x, x0, y0 = _corner(tile, columns)
             top, left = tile_y * TILE, tile_x * TILE
             bottom, right = min(top + TILE, height), min(left + TILE, width)
@@ -344,23 +359,30 @@ def blend_l1(records, entries, starts, busiest, columns, background, target, wei
             losses[tile] = _compare(
                 block, row, target, background, top, left, bottom, right, weight
             )
-            _differentiate_kept(block, kept, records, entries, start, end, x0, y0, own)
+            _differentiate_kept(block, kept, records, entries, start, end, x0, y0, tile_weight, own)
 
 
 @parallel
-def gather(sums, conics, opacities, d_means2d, d_conics, d_opacities, d_colours):
-    """Turn every splat's sums over the parts into the gradients of what was projected."""
+def gather(sums, conics, opacities, d_means2d, d_conics, d_opacities, d_colours, on_screen):
+    """Turn every splat's sums over the parts into the gradients of what was projected.
+
+    ``on_screen`` gets what ``d_means2d`` would be if all tiles that are drawn had the weight 1.
+    """
     for i in prange(conics.shape[0]):
         e, ex, ey = float32(0), float32(0), float32(0)
         exx, exy, eyy = float32(0), float32(0), float32(0)
         red, green, blue = float32(0), float32(0), float32(0)
+        plain_ex, plain_ey = float32(0), float32(0)
         for part in range(PARTS):
             own = sums[part, i]
+            plain_ex, plain_ey = plain_ex + own[WEIGHTED], plain_ey + own[WEIGHTED + 1]
             e, ex, ey = e + own[0], ex + own[1], ey + own[2]
             exx, exy, eyy = exx + own[3], exy + own[4], eyy + own[5]
             red, green, blue = red + own[6], green + own[7], blue + own[8]
         a, b, c = conics[i, 0], conics[i, 1], conics[i, 2]
         d_means2d[i, 0], d_means2d[i, 1] = a * ex + b * ey, b * ex + c * ey
+        on_screen[i, 0] = a * plain_ex + b * plain_ey
+        on_screen[i, 1] = b * plain_ex + c * plain_ey
         d_conics[i, 0], d_conics[i, 1], d_conics[i, 2] = -_HALF * exx, -exy, -_HALF * eyy
         d_opacities[i] = e / opacities[i] if opacities[i] > float32(0) else float32(0)
         d_colours[i, 0], d_colours[i, 1], d_colours[i, 2] = red, green, blue

@@ -27,13 +27,15 @@ from gsdmsr_cli.splatting_constants import TILE
 @serial
 def look(
     means, quats, log_scales, logit_opacities, sh, terms, view, intrinsics, centre, width, height,
-    background, target, ssim_weight, threads,
-    d_means, d_quats, d_log_scales, d_logit_opacities, d_sh, d_means2d,
+    background, target, ssim_weight, threads, tile_weights, errors,
+    d_means, d_quats, d_log_scales, d_logit_opacities, d_sh, on_screen,
 ):  # fmt: skip
     """Return the loss against ``target`` (3, H, W) uint8, and write its gradients.
 
-    Arguments as in ``projection.project``, ``harmonics.colour``, ``blending.blend`` and
-    ``photometric.compare``; every ``d_`` argument has the shape of what it is the gradient of.
+    Arguments as in ``projection.project``, ``harmonics.colour``, ``blending.blend``,
+    ``blending.blend_l1``, ``blending.gather`` and ``photometric.compare``; every ``d_`` argument
+    has the shape of what it is the gradient of. Tiles can only be weighted, and have an error each,
+    if SSIM has no weight.
     """
     n = means.shape[0]
     means2d, conics = np.empty((n, 2), np.float32), np.empty((n, 3), np.float32)
@@ -63,15 +65,20 @@ def look(
             records, entries, starts, busiest, ends, columns, rgb, alpha, d_rgb, d_alpha, sums
         )
     else:
-        shares, count = np.empty(rows * columns), 3 * height * width
+        count = 3 * height * width
         weight = np.float32(1 / count)
         blend_l1(
-            records, entries, starts, busiest, columns, background, target, weight, shares, sums
-        )
-        loss = shares.sum() / count
+            records, entries, starts, busiest, columns, background, target, weight, tile_weights,
+            errors, sums,
+        )  # fmt: skip
+        if tile_weights.shape[0] > 0:
+            loss = (errors * tile_weights).sum() / count
+        else:
+            loss = errors.sum() / count
     d_conics, d_colours = np.empty((n, 3), np.float32), np.empty((n, 3), np.float32)
     d_depths, d_opacities = np.zeros(n, np.float32), np.empty(n, np.float32)
-    gather(sums, conics, opacities, d_means2d, d_conics, d_opacities, d_colours)
+    d_means2d = np.empty((n, 2), np.float32)
+    gather(sums, conics, opacities, d_means2d, d_conics, d_opacities, d_colours, on_screen)
     project_backward(
         means, quats, log_scales, view, intrinsics, width, height, conics, opacities,
         d_means2d, d_conics, d_depths, d_opacities,

@@ -46,10 +46,11 @@ class Motion(Protocol):
     def advance(self, progress: float) -> None:
         """Enter the phase of training that belongs to ``progress`` in [0, 1]."""
 
-    def penalty(self, splats: Splats, time: float) -> Tensor | None:
+    def penalty(self, splats: Splats, time: float, generator: torch.Generator) -> Tensor | None:
         """Return the motion's regularisers at the present values, or None if it has none.
 
-        What depends on positions or time is looked at for ``splats`` at ``time``.
+        What depends on positions or time is looked at for ``splats`` at ``time``; ``generator`` is
+        the source of random choices.
         """
 
     def tensors(self) -> dict[str, Tensor]:

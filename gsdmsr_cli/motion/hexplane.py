@@ -3,12 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import torch
 from torch import Tensor
 
 from gsdmsr_cli.fields import network, planes
-from gsdmsr_cli.fields.deformation import OUTPUTS, displace, name_tensors, time_nodes, trained
+from gsdmsr_cli.fields.deformation import (
+    OUTPUTS,
+    PARTS,
+    displace,
+    name_tensors,
+    time_nodes,
+    trained,
+)
 from gsdmsr_cli.motion import Facts
 from gsdmsr_cli.splats import Splats
 
@@ -21,7 +29,9 @@ class Options:
         levels: spatial nodes of each level along an axis.
         channels: features per level, a multiple of 16.
         time_ratio: nodes in time per distinct train time.
-        width: width of the network's two hidden layers, a multiple of 16.
+        width: width of the network's hidden layers, a multiple of 16.
+        heads: "shared" has two hidden layers; in "separate", as in 4D-GS, position, rotation and
+            scale have a second hidden layer each.
         detach: keep the field's gradient from the canonical positions.
         space_smoothness, time_smoothness, time_stillness: weights of the plane regularisers.
     """
@@ -30,6 +40,7 @@ class Options:
     channels: int = 32
     time_ratio: float = 0.25
     width: int = 64
+    heads: Literal["shared", "separate"] = "shared"
     detach: bool = False
     space_smoothness: float = 1e-4
     time_smoothness: float = 1e-2
@@ -47,14 +58,25 @@ class HexPlaneMotion:
             for resolution in options.levels
         ]
         features = options.channels * len(options.levels)
-        widths = [features, options.width, options.width, OUTPUTS]
+        separate = options.heads == "separate"
+        second = options.width * (len(PARTS) if separate else 1)
+        widths = [features, options.width, second, OUTPUTS]
         self.layers = [trained(layer) for layer in network.new_network(widths, generator)]
+        blocks = [torch.ones(options.width, outputs) for outputs in PARTS]
+        self._own = torch.block_diag(*blocks) if separate else None
 
     def at(self, splats: Splats, time: float) -> Splats:
         """Return the deformed splats; time is mapped to the whole grid, [-1, 1]."""
         points = splats.means.detach() if self.options.detach else splats.means
         features = planes.lookup(self.levels, points, 2 * time - 1, self.facts.box)
-        return displace(splats, network.apply_network(self.layers, features))
+        return displace(splats, network.apply_network(self._network(), features))
+
+    def _network(self) -> list[network.Layer]:
+        """Return the layers, of which the last reads for each output its own head alone."""
+        if self._own is None:
+            return self.layers
+        *layers, last = self.layers
+        return [*layers, network.Layer(last.weight * self._own, last.bias)]
 
     def take(self, rows: Tensor) -> None:
         """Hold nothing per splat."""
@@ -62,7 +84,7 @@ class HexPlaneMotion:
     def advance(self, progress: float) -> None:
         """Have no phases."""
 
-    def penalty(self, splats: Splats, time: float) -> Tensor | None:
+    def penalty(self, splats: Splats, time: float, generator: torch.Generator) -> Tensor | None:
         """Return the plane regularisers."""
         o = self.options
         return planes.penalty(self.levels, o.space_smoothness, o.time_smoothness, o.time_stillness)

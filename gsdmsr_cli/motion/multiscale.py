@@ -22,6 +22,9 @@ from gsdmsr_cli.splats import Splats
 
 _EMBEDDINGS = "embeddings"
 
+SMOOTH_ROWS = 1024
+"""Splats that L_smooth looks at in a step."""
+
 
 @dataclass(frozen=True)
 class Options:
@@ -40,6 +43,9 @@ class Options:
         embedding: features of its own that each splat has, a multiple of 16; 0 as in the method.
         detach: keep the fields' gradient from the canonical positions.
         offset_weight: weight of the mean squared coarse offset, in units of the bound.
+        smooth_weight: weight of the mean squared difference of what the decoder says at a splat's
+            place and beside it; 0 is off.
+        smooth_reach: how far beside, as a standard deviation in units of the bound.
         space_smoothness, time_smoothness, time_stillness: weights of the plane regularisers.
     """
 
@@ -55,6 +61,8 @@ class Options:
     embedding: int = 16
     detach: bool = False
     offset_weight: float = 1e-3
+    smooth_weight: float = 0.0
+    smooth_reach: float = 0.005
     space_smoothness: float = 1e-4
     time_smoothness: float = 1e-2
     time_stillness: float = 1e-4
@@ -100,14 +108,16 @@ class MultiscaleMotion:
             offset = network.apply_network(self.coarse_decoder, features)
             return replace(splats, means=splats.means + offset)
         features = self._features(self.coarse + self.fine, splats, time, self.embeddings)
-        if self.options.pyramid:
-            decoders = [self.coarse_decoder, self.decoder]
-            offset, deformation = network.apply_networks(decoders, features)
-        else:
-            offset = network.apply_network(self.coarse_decoder, features)
-            fine = features[:, self.options.coarse_channels :]
-            deformation = network.apply_network(self.decoder, fine)
+        offset, deformation = self._decode(features)
         return displace(splats, deformation, offset)
+
+    def _decode(self, features: Tensor) -> tuple[Tensor, ...]:
+        """Return what both decoders make of the features of all grids, the coarse one's first."""
+        if self.options.pyramid:
+            return network.apply_networks([self.coarse_decoder, self.decoder], features)
+        offset = network.apply_network(self.coarse_decoder, features)
+        fine = features[:, self.options.coarse_channels :]
+        return offset, network.apply_network(self.decoder, fine)
 
     def _features(
         self,
@@ -127,8 +137,8 @@ class MultiscaleMotion:
         """Let the fine field join after ``coarse_until``."""
         self.fine_active = progress >= self.options.coarse_until
 
-    def penalty(self, splats: Splats, time: float) -> Tensor | None:
-        """Return the plane regularisers of the active grids, and L_reg of the coarse offset."""
+    def penalty(self, splats: Splats, time: float, generator: torch.Generator) -> Tensor | None:
+        """Return the plane regularisers of the active grids, L_reg and L_smooth."""
         o = self.options
         levels = self.coarse + self.fine if self.fine_active else self.coarse
         value = planes.penalty(levels, o.space_smoothness, o.time_smoothness, o.time_stillness)
@@ -136,7 +146,24 @@ class MultiscaleMotion:
             features = self._features(self.coarse, splats, time)
             offset = network.apply_network(self.coarse_decoder, features) / self.facts.bound
             value = value + o.offset_weight * offset.square().sum(dim=1).mean()
+        if o.smooth_weight > 0 and self.fine_active:
+            value = value + o.smooth_weight * self._roughness(splats, time, generator)
         return value
+
+    def _roughness(self, splats: Splats, time: float, generator: torch.Generator) -> Tensor:
+        """Return how much the decoder differs between places that are close to each other.
+
+        A finite difference in place of the method's |grad_x phi|^2, at some of the splats.
+        """
+        rows = torch.randint(len(splats), (SMOOTH_ROWS,), generator=generator)
+        places = splats.means.detach()[rows]
+        reach = self.options.smooth_reach * self.facts.bound
+        beside = places + reach * torch.randn(places.shape, generator=generator)
+        own = self.embeddings[rows].repeat(2, 1)
+        both = replace(splats.take(rows.repeat(2)), means=torch.cat([places, beside]))
+        features = self._features(self.coarse + self.fine, both, time, own)
+        here, there = self._decode(features)[1].chunk(2)
+        return (here - there).square().sum(dim=1).mean()
 
     def tensors(self) -> dict[str, Tensor]:
         """Return both grids, both decoders and, if there are any, the splats' own features."""

@@ -29,7 +29,7 @@ class Static:
     def advance(self, progress: float) -> None:
         """Have no phases."""
 
-    def penalty(self, splats: Splats, time: float) -> Tensor | None:
+    def penalty(self, splats: Splats, time: float, generator: torch.Generator) -> Tensor | None:
         """Have no regularisers."""
         return None
 

@@ -12,9 +12,10 @@ An engine is a module of this package with two functions::
 and, if it can do both in one go faster than one after the other::
 
     def compare(splats: Splats, camera: Camera, background: Tensor, target: Tensor,
-                ssim_weight: float, sh_degree: int | None = None) -> tuple[Tensor, Tensor]
-        # what ``training.losses.photometric_loss`` says of the drawn picture, and the loss's
-        # gradient by the positions on the screen, (N, 2) [1 / px]
+                ssim_weight: float, sh_degree: int | None = None,
+                tile_weights: Tensor | None = None) -> Comparison
+        # what ``training.losses.photometric_loss`` says of the drawn picture; with ssim_weight 0
+        # also of some tiles of it, whose shares of the loss are multiplied by their weights
 
 Gradients reach all five tensors of the splats; ``frame.means2d`` is part of the graph, so that
 ``frame.means2d.retain_grad()`` gives density control its statistic. Every engine is held to
@@ -23,7 +24,7 @@ Gradients reach all five tensors of the splats; ``frame.means2d`` is part of the
 
 from __future__ import annotations
 
-from typing import Protocol, cast, runtime_checkable
+from typing import NamedTuple, Protocol, cast, runtime_checkable
 
 from torch import Tensor
 
@@ -34,6 +35,22 @@ from gsdmsr_cli.frame import Frame
 from gsdmsr_cli.splats import Splats
 
 FASTEST_FIRST = ("cuda", "cpu", "reference")
+
+
+class Comparison(NamedTuple):
+    """What an engine says of a picture that it has drawn and compared.
+
+    Attributes:
+        loss: of the picture.
+        on_screen: (N, 2) gradient of the loss by the positions on the screen [1 / px], as if all
+            tiles with a weight above 0 had the weight 1.
+        errors: (tiles,) float64, the sum of absolute differences in each tile, 0 where it has the
+            weight 0; None where SSIM counts.
+    """
+
+    loss: Tensor
+    on_screen: Tensor
+    errors: Tensor | None
 
 
 class Engine(Protocol):
@@ -65,8 +82,9 @@ class Comparing(Engine, Protocol):
         target: Tensor,
         ssim_weight: float,
         sh_degree: int | None = None,
-    ) -> tuple[Tensor, Tensor]:
-        """Return the loss of the picture and its gradient by the positions on the screen."""
+        tile_weights: Tensor | None = None,
+    ) -> Comparison:
+        """Return what is to be said of the picture."""
 
 
 def load_engine(name: str) -> Engine:

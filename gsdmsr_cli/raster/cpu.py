@@ -15,8 +15,9 @@ from gsdmsr_cli.camera import Camera
 from gsdmsr_cli.frame import Frame
 from gsdmsr_cli.kernels import binning, blending, harmonics, looking, projection
 from gsdmsr_cli.kernels.jit import threads
+from gsdmsr_cli.raster import Comparison
 from gsdmsr_cli.splats import Splats
-from gsdmsr_cli.splatting_constants import TILE
+from gsdmsr_cli.splatting_constants import TILE, tile_grid
 from gsdmsr_cli.tensors import array
 
 
@@ -59,12 +60,18 @@ def compare(
     target: Tensor,
     ssim_weight: float,
     sh_degree: int | None = None,
-) -> tuple[Tensor, Tensor]:
+    tile_weights: Tensor | None = None,
+) -> Comparison:
     """Draw float32 splats and compare, in one call; see ``gsdmsr_cli.raster``."""
+    if tile_weights is not None and ssim_weight > 0:
+        raise ValueError("tiles cannot be weighted where SSIM counts, whose windows overlap them")
     degree = splats.sh_degree if sh_degree is None else min(sh_degree, splats.sh_degree)
     tensors = [tensor.contiguous() for tensor in splats.tensors().values()]
-    loss, on_screen = _Look.apply(camera, degree, background, target, ssim_weight, *tensors)
-    return loss, on_screen
+    weights = torch.empty(0) if tile_weights is None else tile_weights.contiguous()
+    loss, on_screen, errors = _Look.apply(
+        camera, degree, background, target, ssim_weight, weights, *tensors
+    )
+    return Comparison(loss, on_screen, errors if ssim_weight == 0 else None)
 
 
 def _view(camera: Camera) -> tuple[NDArray[np.float32], NDArray[np.float32], int, int]:
@@ -83,26 +90,30 @@ class _Look(Function):
         background: Tensor,
         target: Tensor,
         ssim_weight: float,
+        tile_weights: Tensor,
         *stored: Tensor,
-    ) -> tuple[Tensor, Tensor]:
+    ) -> tuple[Tensor, Tensor, Tensor]:
         gradients = [torch.empty_like(tensor) for tensor in stored]
         on_screen = torch.empty(len(stored[0]), 2)
+        rows, columns = tile_grid(camera.width, camera.height)
+        errors = torch.empty(rows * columns, dtype=torch.float64)
         view, intrinsics, width, height = _view(camera)
         loss = looking.look(
             *map(array, stored), (degree + 1) ** 2, view, intrinsics,
             camera.centre.astype(np.float32), width, height, array(background.contiguous()),
-            array(target), float(ssim_weight), threads(), *map(array, gradients), array(on_screen),
+            array(target), float(ssim_weight), threads(), array(tile_weights), array(errors),
+            *map(array, gradients), array(on_screen),
         )  # fmt: skip
         ctx.gradients = gradients
-        ctx.mark_non_differentiable(on_screen)
-        return torch.tensor(loss, dtype=torch.float32), on_screen
+        ctx.mark_non_differentiable(on_screen, errors)
+        return torch.tensor(loss, dtype=torch.float32), on_screen, errors
 
     @staticmethod
     @once_differentiable  # type: ignore[untyped-decorator]
-    def backward(ctx: Any, d_loss: Tensor, _: Any) -> tuple[Tensor | None, ...]:
+    def backward(ctx: Any, d_loss: Tensor, *_: Any) -> tuple[Tensor | None, ...]:
         scale = float(d_loss)
         passed = (g if scale == 1.0 else g * scale for g in ctx.gradients)
-        return None, None, None, None, None, *passed
+        return None, None, None, None, None, None, *passed
 
 
 class _Project(Function):
@@ -179,7 +190,7 @@ class _Blend(Function):
         background: Tensor,
     ) -> tuple[Tensor, Tensor]:
         width, height = size
-        columns, rows = -(-width // TILE), -(-height // TILE)
+        rows, columns = tile_grid(width, height)
         records = np.empty((len(means2d), blending.RECORD), np.float32)
         screen = [array(t) for t in (means2d, conics, opacities)]
         blending.pack(bins.splats, *screen, array(colours.contiguous()), records)
@@ -215,8 +226,8 @@ class _Blend(Function):
         d_means2d, d_conics, d_colours = (torch.empty(n, k) for k in (2, 3, 3))
         d_opacities = torch.empty(n)
         blending.gather(
-            sums, array(conics), array(opacities),
-            array(d_means2d), array(d_conics), array(d_opacities), array(d_colours),
+            sums, array(conics), array(opacities), array(d_means2d), array(d_conics),
+            array(d_opacities), array(d_colours), np.empty((n, 2), np.float32),
         )  # fmt: skip
         return None, None, d_means2d, d_conics, d_opacities, d_colours, None
 

@@ -11,6 +11,7 @@ from torch.autograd.function import once_differentiable
 
 from gsdmsr_cli.kernels import photometric as kernels
 from gsdmsr_cli.kernels.simd import LANES
+from gsdmsr_cli.splatting_constants import TILE, tile_grid
 from gsdmsr_cli.tensors import array, has_kernels
 
 
@@ -35,6 +36,21 @@ def photometric_loss_twin(rgb: Tensor, target: Tensor, ssim_weight: float) -> Te
     if ssim_weight > 0:
         loss = loss + ssim_weight * (1 - _ssim(drawn, wanted))
     return loss
+
+
+def tile_errors(rgb: Tensor, target: Tensor) -> Tensor:
+    """Return the sum of |rgb - target| in each tile, (tiles,) float64, row by row of tiles.
+
+    Args:
+        rgb: (H, W, 3) drawn picture.
+        target: (3, H, W) uint8 picture.
+    """
+    height, width, _ = rgb.shape
+    rows, columns = tile_grid(width, height)
+    differences = (rgb - target.permute(1, 2, 0).to(rgb.dtype) / 255).abs().sum(dim=2).double()
+    right, below = columns * TILE - width, rows * TILE - height
+    whole = torch.nn.functional.pad(differences, (0, right, 0, below))
+    return whole.view(rows, TILE, columns, TILE).sum(dim=(1, 3)).flatten()
 
 
 def _ssim(x: Tensor, y: Tensor) -> Tensor:

@@ -53,7 +53,8 @@ class Saliency:
 
     def teachers(self, step: int) -> Tensor | None:
         """Return which (N,) splats the motion's shared fields learn from, or None for all."""
-        return None if step % self.options.field_every == 0 else self.high
+        every = self.options.field_every
+        return None if every and step % every == 0 else self.high
 
     def observe(self, now: Tensor, seen: Tensor) -> Tensor:
         """Take note of a step and return which splats (N,) have gone from low to high.

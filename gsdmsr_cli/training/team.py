@@ -20,7 +20,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -31,7 +31,7 @@ from gsdmsr_cli.errors import GsdmsrError
 from gsdmsr_cli.kernels import jit
 from gsdmsr_cli.model import STORED, Model
 from gsdmsr_cli.scene import View
-from gsdmsr_cli.training.look import Look, Observer
+from gsdmsr_cli.training.look import Look, Observer, Stage
 
 T = TypeVar("T")
 
@@ -44,16 +44,17 @@ class _Task:
 
     Attributes:
         still: (N,) which of the splats stand still, if that or their number is new, else None.
+        teachers, progress, moving: see ``Stage``.
         views: rows of the team's views.
-        teachers: (N,) bool or None, see ``Model.at``.
-        progress, moving: see ``Observer.look``.
+        tile_weights: of each view, see ``Observer.look``.
     """
 
     still: NDArray[np.bool_] | None
     teachers: NDArray[np.bool_] | None
-    views: Sequence[int]
     progress: float
     moving: bool
+    views: Sequence[int]
+    tile_weights: Sequence[NDArray[np.float32] | None]
 
 
 @dataclass(frozen=True)
@@ -63,6 +64,7 @@ class _Answer:
     loss: float
     there: Sequence[bool]
     size: tuple[int, int]
+    errors: NDArray[np.float64] | None
 
 
 class Team:
@@ -117,12 +119,11 @@ class Team:
         self,
         model: Model,
         rows: Sequence[int],
-        progress: float,
-        moving: bool,
-        teachers: Tensor | None,
+        stage: Stage,
+        tile_weights: Sequence[Tensor | None],
         meanwhile: Callable[[], T],
     ) -> tuple[list[Look], T]:
-        """Look at the views of these rows, in this order.
+        """Look at the views of these rows, in this order, each with its tile weights.
 
         ``meanwhile`` is called when this process has looked and helpers may not have; what it
         returns is returned as well. The gradients are only good until the next call.
@@ -131,15 +132,15 @@ class Team:
             GsdmsrError: a helper has ended.
             DataError: a picture cannot be read.
         """
-        shares = [rows[i :: len(self)] for i in range(len(self))]
+        views = list(zip(rows, tile_weights, strict=True))
+        shares = [views[i :: len(self)] for i in range(len(self))]
         busy = [pair for pair in zip(self._helpers, shares[1:], strict=True) if pair[1]]
         if busy:
             self._published.hold(model)
         for helper, share in busy:
-            helper.send(model, share, progress, moving, teachers)
+            helper.send(model, share, stage)
         own = [
-            self.observer.look(model, self.views[row], progress, moving, teachers)
-            for row in shares[0]
+            self.observer.look(model, self.views[row], stage, weights) for row, weights in shares[0]
         ]
         other = meanwhile()
         looks = [own] + [helper.looks(model) for helper, _ in busy]
@@ -187,20 +188,17 @@ class _Helper:
             self.receive()
             self.ready = True
 
-    def send(
-        self,
-        model: Model,
-        views: Sequence[int],
-        progress: float,
-        moving: bool,
-        teachers: Tensor | None,
-    ) -> None:
+    def send(self, model: Model, views: Sequence[tuple[int, Tensor | None]], stage: Stage) -> None:
         self.wait()
-        still = None if model.still is self._told else model.still.numpy()
+        still = None if model.still is self._told else model.still
         self._told = model.still  # a model never changes it in place
-        taught = None if teachers is None else teachers.numpy()
+        rows, weights = zip(*views, strict=True)
+        task = _Task(
+            _sent(still), _sent(stage.teachers), stage.progress, stage.moving, rows,
+            [_sent(own) for own in weights],
+        )  # fmt: skip
         try:
-            self.pipe.send(_Task(still, taught, views, progress, moving))
+            self.pipe.send(task)
         except OSError as error:
             raise self._has_ended() from error
 
@@ -224,7 +222,8 @@ class _Helper:
                 for there, (name, shape) in zip(answer.there, shapes.items(), strict=True)
             ]
             on_screen = shelf.tensor(_ON_SCREEN, (len(model.splats), 2))
-            looks.append(Look(answer.loss, gradients, on_screen, answer.size))
+            errors = _received(answer.errors)
+            looks.append(Look(answer.loss, gradients, on_screen, answer.size, errors))
         return looks
 
     def end(self) -> None:
@@ -268,11 +267,10 @@ class _Desk:
             model.become(torch.from_numpy(task.still))
             self.published.lend(model)
         model.motion.advance(task.progress)
-        teachers = None if task.teachers is None else torch.from_numpy(task.teachers)
+        stage = Stage(task.progress, task.moving, _received(task.teachers))
         answers = []
-        for row, shelf in zip(task.views, self.answers, strict=False):
-            view = self._views[row]
-            look = self._observer.look(model, view, task.progress, task.moving, teachers)
+        for row, sent, shelf in zip(task.views, task.tile_weights, self.answers, strict=False):
+            look = self._observer.look(model, self._views[row], stage, _received(sent))
             answers.append(self._answer(look, shelf))
         return answers
 
@@ -280,7 +278,17 @@ class _Desk:
         gradients = dict(zip(self._model.tensors(), look.gradients, strict=True))
         gradients[_ON_SCREEN] = look.on_screen
         shelf.write({name: tensor for name, tensor in gradients.items() if tensor is not None})
-        return _Answer(look.loss, [tensor is not None for tensor in look.gradients], look.size)
+        there = [tensor is not None for tensor in look.gradients]
+        return _Answer(look.loss, there, look.size, _sent(look.errors))
+
+
+def _sent(tensor: Tensor | None) -> NDArray[Any] | None:
+    """Return what goes through a pipe; torch would put a tensor into a file of shared memory."""
+    return None if tensor is None else tensor.numpy()
+
+
+def _received(array: NDArray[Any] | None) -> Tensor | None:
+    return None if array is None else torch.from_numpy(array)
 
 
 def _serve(

@@ -23,12 +23,13 @@ from gsdmsr_cli.splats import NAMES, Splats
 from gsdmsr_cli.training import averaging
 from gsdmsr_cli.training.density import DensityStatistics, grow_and_prune, reset_opacities
 from gsdmsr_cli.training.initial import initial_splats
-from gsdmsr_cli.training.look import Look, Observer
+from gsdmsr_cli.training.look import Look, Observer, Stage
 from gsdmsr_cli.training.optimizer import Adam, Gate
 from gsdmsr_cli.training.saliency import Saliency, step_saliency
 from gsdmsr_cli.training.schedule import log_linear, new_clock
 from gsdmsr_cli.training.stillness import motion_saliency
 from gsdmsr_cli.training.team import Team
+from gsdmsr_cli.training.tiles import TileSampler
 
 PENALTY_EVERY = 4
 """Regularisers are slow to change and cost a pass over all planes: every 4th step, 4 times."""
@@ -44,7 +45,7 @@ PATIENCE = 20
 """Consecutive steps without a finite loss after which training gives up."""
 
 _FIRST, _SECOND, _SEEN, _LAST = "adam.first.", "adam.second.", "density.", "last."
-_SALIENCY = "saliency."
+_SALIENCY, _TILES = "saliency.", "tiles."
 
 
 @dataclass(frozen=True)
@@ -79,6 +80,7 @@ class Trainer:
         self.optimizer = Adam()
         self.saliency = Saliency(len(self.model.splats), preset.saliency)
         self.statistics = DensityStatistics(len(self.model.splats))
+        self.tiles = TileSampler(preset.training.tiles_per_view)
         self.average = averaging.Average()
         self.clock = new_clock(preset.training)
         self._queue: list[int] = []
@@ -105,9 +107,11 @@ class Trainer:
         tensors = self.model.tensors()
         gated = self._is_gated(progress)
         teachers = self.saliency.teachers(self.clock.step) if gated else None
+        stage = Stage(progress, self._moving, teachers)
+        tile_weights = [self._choose_tiles(row, progress) for row in rows]
         penalised = self._moving and self.clock.step % PENALTY_EVERY == 0
         looks, penalty = self.team.look(
-            self.model, rows, progress, self._moving, teachers,
+            self.model, rows, stage, tile_weights,
             lambda: self._penalise(tensors, self.views[rows[0]]) if penalised else None,
         )  # fmt: skip
         value = fmean(look.loss for look in looks)
@@ -122,19 +126,25 @@ class Trainer:
         if not math.isfinite(value):
             return self._skip()
         self._skipped = 0
+        for row, weights, look in zip(rows, tile_weights, looks, strict=True):
+            if weights is not None and look.errors is not None:
+                self.tiles.learn(row, weights, look.errors)
         if progress < self.preset.density.until:
             for look in looks:
                 self.statistics.observe(look.on_screen, *look.size)
-        gates = self._gates(tensors) if gated else {}
-        with self.team.all_threads():
-            self.optimizer.step(tensors, self._rates(progress), gates)
-        if gated:
-            self._attend(looks, gates)
+        self._learn(tensors, progress, looks if gated else None)
         self._control_density(progress)
         self._settle(progress)
         if self.clock.step % averaging.EVERY == 0:
             self._average(progress)
         return Step(value)
+
+    def _choose_tiles(self, row: int, progress: float) -> Tensor | None:
+        """Return the tile weights of a view of the next step, or None for the whole picture."""
+        tiles = self.observer.tiles(self.views[row], progress)
+        if not 0 < self.tiles.count < tiles:
+            return None
+        return self.tiles.choose(row, tiles, self.generator)
 
     def _average(self, progress: float) -> None:
         if progress >= self.preset.training.average_from:
@@ -153,7 +163,7 @@ class Trainer:
         self, tensors: Mapping[str, Tensor], view: View
     ) -> tuple[float, Sequence[Tensor | None]]:
         """Return the penalty and its gradients."""
-        penalty = self.model.penalty(view.time)
+        penalty = self.model.penalty(view.time, self.generator)
         if penalty is None:
             return 0.0, [None] * len(tensors)
         gradients = torch.autograd.grad(penalty, list(tensors.values()), allow_unused=True)
@@ -186,6 +196,21 @@ class Trainer:
         rates = {STORED_AS + name: groups[name] for name in NAMES}
         moving = self.model.motion.groups()
         return rates | {MOVED_BY + name: groups[group] for name, group in moving.items()}
+
+    def _learn(
+        self, tensors: Mapping[str, Tensor], progress: float, watched: Sequence[Look] | None
+    ) -> None:
+        """Let Adam step; where the splats are gated, their saliency follows what was looked at."""
+        gates = {} if watched is None else self._gates(tensors)
+        share = self.preset.optimizer.sh_rest
+        rest = self.model.splats.sh.detach()[:, 1:]
+        before = None if share == 1 else rest.clone()
+        with self.team.all_threads():
+            self.optimizer.step(tensors, self._rates(progress), gates)
+        if before is not None:
+            rest.copy_(torch.lerp(before, rest, share))
+        if watched is not None:
+            self._attend(watched, gates)
 
     def _is_gated(self, progress: float) -> bool:
         options = self.preset.saliency
@@ -280,6 +305,7 @@ class Trainer:
         tensors[_SEEN + "total"] = self.statistics.total
         tensors[_SEEN + "views"] = self.statistics.views
         tensors |= {_SALIENCY + name: t for name, t in self.saliency.tensors().items()}
+        tensors |= {_TILES + name: t for name, t in self.tiles.tensors().items()}
         tensors["generator"] = self.generator.get_state()
         state = {
             "queue": self._queue,
@@ -298,27 +324,30 @@ class Trainer:
         self.average.count = int(state["averaged"])
         last = dict(tensors)
         if self.average.count:
-            last = {n.removeprefix(_LAST): t for n, t in tensors.items() if n.startswith(_LAST)}
+            last = _below(_LAST, tensors)
             self.average.tensors = {name: tensors[name] for name in last}
             if STILL in tensors:
                 last[STILL] = tensors[STILL]
         self.model = load_model(last, self.preset.motion, self.facts, checkpoint.progress)
-        for moments, prefix in ((self.optimizer.first, _FIRST), (self.optimizer.second, _SECOND)):
-            moments.update(
-                {n.removeprefix(prefix): t for n, t in tensors.items() if n.startswith(prefix)}
-            )
+        self.optimizer.first.update(_below(_FIRST, tensors))
+        self.optimizer.second.update(_below(_SECOND, tensors))
         self.optimizer.steps = {name: int(count) for name, count in state["adam_steps"].items()}
         self.statistics = DensityStatistics(len(self.model.splats))
         self.statistics.total, self.statistics.views = (
             tensors[_SEEN + "total"],
             tensors[_SEEN + "views"],
         )
-        kept = {n.removeprefix(_SALIENCY): t for n, t in tensors.items() if n.startswith(_SALIENCY)}
-        self.saliency.restore(kept)
+        self.saliency.restore(_below(_SALIENCY, tensors))
+        self.tiles.restore(_below(_TILES, tensors))
         self.generator.set_state(tensors["generator"])
         self._queue, self._resets = list(state["queue"]), int(state["resets"])
         self._moving = bool(state["moving"])
         self.clock.step, self.clock.before = checkpoint.step, checkpoint.elapsed
+
+
+def _below(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Return the tensors whose names begin with the prefix, without it."""
+    return {n.removeprefix(prefix): t for n, t in tensors.items() if n.startswith(prefix)}
 
 
 def facts_of(scene: Scene, splats: Splats) -> Facts:

@@ -60,7 +60,7 @@ def warm_up_motion(scene: Scene, preset: Preset, engine: Engine) -> None:
             model.motion.advance(step / STEPS)
             splats = model.at(0.5)
             outcome = splats.means.sum() + splats.quats.sum() + splats.log_scales.sum()
-            penalty = model.penalty(0.5)
+            penalty = model.penalty(0.5, torch.Generator())
             torch.autograd.backward([outcome] if penalty is None else [outcome, penalty])
 
 

@@ -113,7 +113,7 @@ def test_groups_name_trained_tensors_and_learning_rates(name: str) -> None:
 @every_motion
 def test_penalty_is_a_finite_scalar_that_can_be_learnt_from(name: str) -> None:
     motion = disturbed(started(name, COUNT))
-    penalty = motion.penalty(splats_of(COUNT), 0.4)
+    penalty = motion.penalty(splats_of(COUNT), 0.4, generator())
     if penalty is None:
         return
     assert penalty.shape == () and penalty.isfinite() and penalty > 0
@@ -182,7 +182,7 @@ def gradients_before_and_after(motion: Motion, progress: tuple[float, float]) ->
     for now in progress:
         motion.advance(now)
         loss = weighted_sum(motion.at(splats_of(COUNT), 0.3))
-        penalty = motion.penalty(splats_of(COUNT), 0.3)
+        penalty = motion.penalty(splats_of(COUNT), 0.3, generator())
         assert penalty is not None
         (loss + penalty).backward()
         tensors = motion.tensors()
@@ -219,7 +219,7 @@ def test_multiscale_regularises_the_coarse_offset() -> None:
     motion = disturbed(started("multiscale", offset_weight=2.0, coarse_until=1.0, **weights))
     motion.advance(0.0)
     offset = motion.at(splats, 0.6).means - splats.means
-    penalty = motion.penalty(splats, 0.6)
+    penalty = motion.penalty(splats, 0.6, generator())
     assert penalty is not None
     expected = 2.0 * (offset / FACTS.bound).square().sum(dim=1).mean()
     torch.testing.assert_close(penalty, expected, rtol=1e-4, atol=1e-9)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
-from functools import cache
+from functools import cache, partial
 
 import pytest
 import torch
@@ -21,8 +22,8 @@ from raster_scenes import (
 from torch import Tensor
 
 from gsdmsr_cli.raster import Comparing, Engine, engine_names, load_engine, reference
-from gsdmsr_cli.splatting_constants import ALPHA_MAX, TRANSMITTANCE_STOP
-from gsdmsr_cli.training.losses import photometric_loss
+from gsdmsr_cli.splatting_constants import ALPHA_MAX, TRANSMITTANCE_STOP, tile_grid
+from gsdmsr_cli.training.look import draw_and_compare
 
 FORWARD = 1e-4  # largest error of a pixel; of depth, relative to the farthest splat
 BACKWARD = 1e-3  # error of a gradient in the L2 norm, relative
@@ -159,8 +160,15 @@ def test_zero_splats_give_the_background(placed: Placed) -> None:
     assert not frame.alpha.any()
 
 
-def compared(placed: Placed, name: str, ssim: float) -> tuple[list[Tensor], list[Tensor]]:
-    """Loss, gradients and screen gradients by ``compare``, and by drawing first."""
+def compared(
+    placed: Placed, name: str, ssim: float, chosen: bool = False
+) -> tuple[list[Tensor], list[Tensor]]:
+    """Loss, gradients, screen gradients and tile errors by ``compare``, and by drawing first.
+
+    Args:
+        ssim: weight of SSIM.
+        chosen: weigh the tiles, and leave every third out.
+    """
     engine, device = placed
     if not isinstance(engine, Comparing):
         pytest.skip("the engine draws and compares one after the other")
@@ -170,11 +178,18 @@ def compared(placed: Placed, name: str, ssim: float) -> tuple[list[Tensor], list
     background = of.background.to(device)
     leaves = of.splats.map(lambda t: t.detach().clone().to(device).requires_grad_())
     tensors = list(leaves.tensors().values())
-    loss, on_screen = engine.compare(leaves, of.camera, background, target, ssim, of.sh_degree)
-    found = [loss, *torch.autograd.grad(2 * loss, tensors), 2 * on_screen]
-    frame = engine.rasterize(leaves, of.camera, background, of.sh_degree)
-    loss = photometric_loss(frame.rgb, target, ssim)
-    return found, [loss, *torch.autograd.grad(2 * loss, [*tensors, frame.means2d])]
+    weights = None
+    if chosen:
+        tiles = math.prod(tile_grid(of.camera.width, of.camera.height))
+        weights = torch.rand(tiles, generator=rng).to(device) * 3
+        weights[::3] = 0
+    results = []
+    for compare in (engine.compare, partial(draw_and_compare, engine)):
+        found = compare(leaves, of.camera, background, target, ssim, of.sh_degree, weights)
+        gradients = torch.autograd.grad(2 * found.loss, tensors)
+        errors = [] if found.errors is None else [found.errors]
+        results.append([found.loss, *gradients, found.on_screen, *errors])
+    return results[0], results[1]
 
 
 @pytest.mark.parametrize("ssim", [0.0, 0.2])
@@ -182,6 +197,17 @@ def compared(placed: Placed, name: str, ssim: float) -> tuple[list[Tensor], list
 def test_comparing_is_drawing_and_then_comparing(placed: Placed, name: str, ssim: float) -> None:
     for found, expected in zip(*compared(placed, name, ssim), strict=True):
         torch.testing.assert_close(found, expected, atol=1e-7, rtol=1e-5)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_tiles_count_by_their_weights(placed: Placed, name: str) -> None:
+    for found, expected in zip(*compared(placed, name, 0.0, chosen=True), strict=True):
+        torch.testing.assert_close(found, expected, atol=2e-7, rtol=2e-5)
+
+
+def test_tiles_cannot_be_weighted_where_ssim_counts(placed: Placed) -> None:
+    with pytest.raises(ValueError, match="SSIM"):
+        compared(placed, "64x48", 0.2, chosen=True)
 
 
 @pytest.fixture
@@ -208,6 +234,7 @@ def test_result_does_not_depend_on_the_number_of_threads(name: str) -> None:
         numba.set_num_threads(threads)
         drawn.append(draw(engine, case(name), weights, "cpu", torch.float32))
         losses.append([t for w in (0.0, 0.2) for t in compared((engine, "cpu"), name, w)[0]])
+        losses[-1] += compared((engine, "cpu"), name, 0.0, chosen=True)[0]
     for found, expected in zip(*losses, strict=True):
         assert torch.equal(found, expected)
     one, two = drawn
