@@ -237,6 +237,10 @@ def scenes(
     preset: Annotated[
         list[str] | None, typer.Option(metavar="NAME", help="Preset; repeatable.")
     ] = None,
+    config: Annotated[
+        list[Path] | None,
+        typer.Option(metavar="F.yaml", help="File of options in place of a preset; repeatable."),
+    ] = None,
     budget: Annotated[
         list[str] | None, typer.Option(metavar="8m", help="Wall time of a training; repeatable.")
     ] = None,
@@ -264,7 +268,8 @@ def scenes(
     from gsdmsr_cli.commands import benchmark_scenes as command
 
     terms = Terms(downscale, background, split, lpips_weights)
-    command.run(folders, out, preset or ["dnerf"], lengths, seed or [0], terms, as_json)
+    presets: list[str | Path] = [*(preset or []), *(config or [])]
+    command.run(folders, out, presets or ["dnerf"], lengths, seed or [0], terms, as_json)
 
 
 # The command-line errors of typer share this base, which typer does not export by name.

@@ -7,6 +7,7 @@ from typing import Any
 
 from gsdmsr_cli.benchmark.trials import Trial
 from gsdmsr_cli.evaluation.protocol import average
+from gsdmsr_cli.scene import SPLITS
 
 MEAN = "mean"
 """What stands for a scene in the rows that average over scenes."""
@@ -15,6 +16,8 @@ COLUMNS = {
     "psnr": ".2f",
     "spread": ".2f",
     "train_psnr": ".2f",
+    "val_psnr": ".2f",
+    "test_psnr": ".2f",
     "ssim": ".4f",
     "lpips_alex": ".4f",
     "fps": ".0f",
@@ -41,7 +44,7 @@ def rows_of(scored: Scored) -> list[dict[str, Any]]:
     """
     groups: dict[tuple[str | int, str, str], list[dict[str, float | None]]] = {}
     for trial, document in scored:
-        key = trial.length, trial.preset, trial.scene.resolve().name
+        key = trial.length, trial.name, trial.scene.resolve().name
         groups.setdefault(key, []).append(_values(document))
     rows = [_row(key, values) for key, values in groups.items()]
     means: dict[tuple[str | int, str], list[dict[str, Any]]] = {}
@@ -54,10 +57,10 @@ def rows_of(scored: Scored) -> list[dict[str, Any]]:
 
 def _values(document: Mapping[str, Any]) -> dict[str, float | None]:
     aggregate, training = document["aggregate"], document["training"]
-    storage = document["storage"]
+    storage, splits = document["storage"], document["splits"]
     return {
         "psnr": aggregate["psnr"],
-        "train_psnr": document["aggregate_train"]["psnr"],
+        **{f"{split}_psnr": splits.get(split, {}).get("psnr") for split in SPLITS},
         "ssim": aggregate["ssim"],
         "lpips_alex": aggregate["lpips_alex"]["value"],
         "fps": document["speed"]["fps"],

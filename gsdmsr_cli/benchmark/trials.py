@@ -19,7 +19,7 @@ from typing import Any
 from gsdmsr_cli.errors import DataError, GsdmsrError
 from gsdmsr_cli.files import read_json
 from gsdmsr_cli.formats import read_scene
-from gsdmsr_cli.preset import load_preset
+from gsdmsr_cli.preset import Preset, load_preset
 from gsdmsr_cli.run import Run, is_run, open_run
 
 INTERRUPTED = 130
@@ -49,20 +49,35 @@ class Trial:
 
     Attributes:
         scene: folder of the scene.
-        preset: name of the preset.
+        preset: name of the preset, or a file of options that says what it is based on.
         length: a budget such as "8m", or a number of steps.
         seed: of every random choice.
     """
 
     scene: Path
-    preset: str
+    preset: str | Path
     length: str | int
     seed: int
+
+    @property
+    def name(self) -> str:
+        """What the preset is called in tables."""
+        return self.preset.stem if isinstance(self.preset, Path) else self.preset
+
+    def options(self, terms: Terms) -> Preset:
+        """Return all options of the training.
+
+        Raises:
+            UsageError: see ``load_preset``.
+        """
+        if isinstance(self.preset, Path):
+            return load_preset(None, self.preset, self.overrides(terms))
+        return load_preset(self.preset, None, self.overrides(terms))
 
     def folder(self, root: Path) -> Path:
         """Return the run folder below ``root``."""
         length = self.length if isinstance(self.length, str) else f"{self.length}steps"
-        return root / self.scene.resolve().name / f"{self.preset}-{length}-{self.seed}"
+        return root / self.scene.resolve().name / f"{self.name}-{length}-{self.seed}"
 
     def overrides(self, terms: Terms) -> list[str]:
         """Return what differs from the preset, as ``--set`` takes it."""
@@ -78,19 +93,22 @@ class Trial:
 
 def all_trials(
     scenes: Sequence[Path],
-    presets: Sequence[str],
+    presets: Sequence[str | Path],
     lengths: Sequence[str | int],
     seeds: Sequence[int],
 ) -> list[Trial]:
     """Return every combination, so ordered that a part of them is a table already.
 
     Raises:
-        DataError: two scenes would share a folder.
+        DataError: two scenes or two presets would share a folder.
     """
-    names = [scene.resolve().name for scene in scenes]
-    for name in names:
-        if names.count(name) > 1:
-            raise DataError(f"two scenes are called '{name}'; give each folder its own name, once")
+    for kind, names in (
+        ("scene", [scene.resolve().name for scene in scenes]),
+        ("preset", [Trial(scenes[0], preset, 1, 0).name for preset in presets]),
+    ):
+        for name in names:
+            if names.count(name) > 1:
+                raise DataError(f"two {kind}s are called '{name}'; each needs its own name, once")
     combined = itertools.product(lengths, seeds, presets, scenes)
     return [Trial(scene, preset, length, seed) for length, seed, preset, scene in combined]
 
@@ -112,7 +130,8 @@ def run_trial(trial: Trial, root: Path, terms: Terms) -> dict[str, Any]:
         settings = [f"--set={override}" for override in trial.overrides(terms)]
         how = "--overwrite" if saved is None else "--resume"
         places = ["--data", str(trial.scene), "--out", str(folder)]
-        _gsdmsr("train", *places, "--preset", trial.preset, *settings, how)
+        kind = "--config" if isinstance(trial.preset, Path) else "--preset"
+        _gsdmsr("train", *places, kind, str(trial.preset), *settings, how)
         saved = None
     report = folder / "eval" / "metrics.json"
     if saved is None or not _is_report_of(report, saved.step, terms):
@@ -122,9 +141,9 @@ def run_trial(trial: Trial, root: Path, terms: Terms) -> dict[str, Any]:
 
 
 def _require_same(run: Run, trial: Trial, terms: Terms) -> None:
-    if run.preset != load_preset(trial.preset, None, trial.overrides(terms)):
+    if run.preset != trial.options(terms):
         raise DataError(
-            f"{run.root}: holds a training with other options than '{trial.preset}' has now; "
+            f"{run.root}: holds a training with other options than '{trial.name}' has now; "
             "choose another --out"
         )
     run.check_scene(read_scene(trial.scene))

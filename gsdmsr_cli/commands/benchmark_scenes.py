@@ -11,11 +11,11 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
+from gsdmsr_cli.benchmark.curves import charts_of
 from gsdmsr_cli.benchmark.scoreboard import HEADS, TEXTS, cells, markdown, rows_of
 from gsdmsr_cli.benchmark.trials import Terms, all_trials, run_trial
 from gsdmsr_cli.files import replacing, write_json
 from gsdmsr_cli.formats import read_scene
-from gsdmsr_cli.preset import load_preset
 
 SCHEMA = 1
 
@@ -26,15 +26,15 @@ WIDTH = 200
 def run(
     scenes: Sequence[Path],
     out: Path,
-    presets: Sequence[str],
+    presets: Sequence[str | Path],
     lengths: Sequence[str | int],
     seeds: Sequence[int],
     terms: Terms,
     as_json: bool,
 ) -> None:
-    """Run every trial that is still to do; write ``out/table.json`` and ``out/table.md``.
+    """Run every trial that is still to do, and write ``table.json``, ``table.md`` and charts.
 
-    Both are written after every trial, so that an interrupted benchmark leaves a table.
+    They are written after every trial, so that an interrupted benchmark leaves a table.
 
     Raises:
         UsageError: a preset or a length does not exist.
@@ -44,7 +44,7 @@ def run(
     """
     trials = all_trials(scenes, presets, lengths, seeds)
     for trial in trials:  # told now rather than after hours
-        load_preset(trial.preset, None, trial.overrides(terms))
+        trial.options(terms)
     for scene in scenes:
         read_scene(scene)
     console, scored = Console(stderr=True), []
@@ -53,6 +53,8 @@ def run(
         scored.append((trial, run_trial(trial, out, terms)))
         rows = rows_of(scored)
         _write(out, rows, terms)
+        for name, chart in charts_of([trial for trial, _ in scored], out).items():
+            _write_text(out / f"psnr-{name}.svg", chart)
     if as_json:
         sys.stdout.write(json.dumps(_document(rows, terms)) + "\n")
     else:
@@ -71,8 +73,12 @@ def _document(rows: Sequence[dict[str, Any]], terms: Terms) -> dict[str, Any]:
 
 def _write(out: Path, rows: Sequence[dict[str, Any]], terms: Terms) -> None:
     write_json(out / "table.json", _document(rows, terms))
-    with replacing(out / "table.md") as beside:
-        beside.write_text(markdown(rows), encoding="utf-8")
+    _write_text(out / "table.md", markdown(rows))
+
+
+def _write_text(path: Path, text: str) -> None:
+    with replacing(path) as beside:
+        beside.write_text(text, encoding="utf-8")
 
 
 def _table(rows: Sequence[dict[str, Any]], terms: Terms) -> Table:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,20 +18,21 @@ from gsdmsr_cli.commands._progress import progress_bar
 from gsdmsr_cli.commands._trained import Trained, open_trained
 from gsdmsr_cli.errors import ThresholdError, UsageError, nearest
 from gsdmsr_cli.evaluation import protocol
-from gsdmsr_cli.evaluation.lpips import NETS
+from gsdmsr_cli.evaluation.lpips import NETS, Lpips, Missing
 from gsdmsr_cli.evaluation.speed import measure_speed
 from gsdmsr_cli.files import read_json, write_json
-from gsdmsr_cli.scene import View
+from gsdmsr_cli.scene import SPLITS, View
 
 SCHEMA = 1
 
-TRAIN_VIEWS = 20
-"""Train views, evenly spaced, whose PSNR is reported beside that of unseen views."""
+OTHER_VIEWS = 20
+"""Views of every other split, evenly spaced, whose PSNR is reported beside that of ``split``."""
 
 _DISTANCES = tuple(f"lpips_{net}" for net in NETS)
 _METRICS = ("psnr", "psnr_float", "ssim", *_DISTANCES)
 
 Thresholds = list[tuple[str, float]]
+Scored = Sequence[tuple[View, protocol.Scores]]
 
 
 def run(
@@ -74,14 +76,11 @@ def _measure(
     camera = studio.pictures.camera(views[0])
     resolution = camera.width, camera.height
     nets = protocol.load_nets(resolution, folder=lpips_weights)
-    seen = _evenly(trained.scene.split("train"), TRAIN_VIEWS)
-    total = len(views) + len(seen)
-    with progress_bar("comparing pictures") as tell:
-        frames = protocol.score_views(studio, views, nets, lambda done: tell(done, total))
-        train = protocol.score_views(studio, seen, {}, lambda done: tell(len(views) + done, total))
+    by_split = _score_splits(trained, split, nets)
+    frames = by_split[split]
     shots = [(studio.pictures.camera(view), view.time) for view in views]
     speed = measure_speed(studio.model, shots, studio.engine, studio.background)
-    aggregate = protocol.average([scores for _, scores in frames])
+    aggregate = _mean(frames)
     options, checkpoint = trained.run.preset, trained.checkpoint
     return {
         "schema": SCHEMA,
@@ -103,9 +102,9 @@ def _measure(
             "versions": machine.versions(),
         },
         "aggregate": protocol.with_reasons(aggregate, nets),
-        "aggregate_train": {
-            "psnr": protocol.average([scores for _, scores in train])["psnr"],
-            "frames": len(seen),
+        "splits": {
+            name: {"psnr": _mean(scored)["psnr"], "frames": len(scored)}
+            for name, scored in by_split.items()
         },
         "frames": [{"name": view.name, "time": view.time, **scores} for view, scores in frames],
         "speed": speed.document(),
@@ -115,6 +114,34 @@ def _measure(
         },
         "training": _training(trained),
     }
+
+
+def _score_splits(
+    trained: Trained, split: str, nets: Mapping[str, Lpips | Missing]
+) -> dict[str, Scored]:
+    """Return the scores of all views of one split, and of some of every other there is."""
+    chosen: dict[str, Sequence[View]] = {split: trained.scene.split(split)}
+    for other in SPLITS:
+        views = [view for view in trained.scene.views if view.split == other]
+        if views and other != split:
+            chosen[other] = _evenly(views, OTHER_VIEWS)
+    total = sum(map(len, chosen.values()))
+    scored: dict[str, Scored] = {}
+    with progress_bar("comparing pictures") as tell:
+        for name, own_views in chosen.items():
+            before, own = sum(map(len, scored.values())), nets if name == split else {}
+            scored[name] = protocol.score_views(
+                trained.studio, own_views, own, partial(_tell_more, tell, before, total)
+            )
+    return scored
+
+
+def _tell_more(tell: Callable[[int, int], None], before: int, total: int, done: int) -> None:
+    tell(before + done, total)
+
+
+def _mean(scored: Scored) -> protocol.Scores:
+    return protocol.average([scores for _, scores in scored])
 
 
 def _evenly(views: Sequence[View], count: int) -> list[View]:
@@ -181,8 +208,10 @@ def _table(document: Mapping[str, Any]) -> Table:
         value = _value(aggregate, metric)
         reason = "" if value is not None else _reason(aggregate[metric])
         table.add_row(metric, f"{value:.4f}" if value is not None else f"none: {escape(reason)}")
-    train = document["aggregate_train"]["psnr"]
-    table.add_row("psnr of train views", "none" if train is None else f"{train:.4f}")
+    for split, scores in document["splits"].items():
+        if split != about["split"]:
+            value = scores["psnr"]
+            table.add_row(f"psnr of {split} views", "none" if value is None else f"{value:.4f}")
     table.add_row("frames a second", f"{document['speed']['fps']:.1f}")
     table.add_row("  without motion", f"{document['speed']['fps_raster']:.1f}")
     stored = document["storage"]

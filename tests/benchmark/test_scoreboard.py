@@ -18,7 +18,7 @@ def trial(scene: str, preset: str = "dnerf", seed: int = 0) -> Trial:
 def document(psnr: float | None, lpips: float | None = 0.25) -> dict[str, Any]:
     return {
         "aggregate": {"psnr": psnr, "ssim": 0.5, "lpips_alex": {"value": lpips}},
-        "aggregate_train": {"psnr": 40.0},
+        "splits": {"test": {"psnr": psnr}, "train": {"psnr": 40.0}},
         "speed": {"fps": 100.0},
         "storage": {"splats_bytes": 2_000_000, "motion_bytes": 500_000, "training_state_bytes": 7},
         "training": {"splats": 10, "steps": 200, "train_s": 5.0},
@@ -29,7 +29,8 @@ def test_a_single_trial() -> None:
     (row,) = rows_of([(trial("lego"), document(30.0))])
     assert row == {
         "scene": "lego", "preset": "dnerf", "length": "2m", "trials": 1, "psnr": 30.0,
-        "spread": None, "train_psnr": 40.0, "ssim": 0.5, "lpips_alex": 0.25, "fps": 100.0,
+        "spread": None, "train_psnr": 40.0, "val_psnr": None, "test_psnr": 30.0, "ssim": 0.5,
+        "lpips_alex": 0.25, "fps": 100.0,
         "model_mb": 2.5, "splats": 10, "steps": 200, "ms_per_step": 25.0,
     }  # fmt: skip
 
@@ -68,5 +69,19 @@ def test_the_table_has_a_line_for_every_row(count: int) -> None:
     assert len(lines) == 2 + count + (count > 1)
     assert lines[0].startswith("| scene | preset | length | trials | psnr | spread |")
     assert {line.count("|") for line in lines} == {5 + len(COLUMNS)}
-    values = ["1", "30.00", "", "40.00", "0.5000", "0.2500", "100", "2.50", "10", "200", "25.0"]
+    values = [
+        "1",
+        "30.00",
+        "",
+        "40.00",
+        "",
+        "30.00",
+        "0.5000",
+        "0.2500",
+        "100",
+        "2.50",
+        "10",
+        "200",
+        "25.0",
+    ]
     assert lines[2] == f"| {' | '.join(['s0', 'dnerf', '2m', *values])} |"

@@ -174,6 +174,26 @@ def test_the_table_of_a_benchmark(tiny_scene: Path, finished: Path, tmp_path: Pa
     scores = json.loads(report.read_text(encoding="utf-8"))["aggregate"]
     assert document["rows"][1]["psnr"] == scores["psnr"]
     assert f"| {scores['psnr']:.2f} |" in (out / "table.md").read_text(encoding="utf-8")
+    assert {"test_psnr", "val_psnr", "train_psnr"} <= {
+        k for k, v in document["rows"][1].items() if v
+    }
+    chart = (out / f"psnr-{tiny_scene.name}.svg").read_text(encoding="utf-8")
+    assert ">static<" in chart and ">dnerf<" in chart
+
+
+def test_a_file_of_options_competes_under_its_name(tiny_scene: Path, tmp_path: Path) -> None:
+    config = tmp_path / "slow.yaml"
+    config.write_text("base: static\noptimizer: {means: [1e-5, 1e-5]}\n", encoding="utf-8")
+    trial = Trial(tiny_scene, config, STEPS, 1)
+    assert trial.folder(Path("out")) == Path("out") / tiny_scene.name / f"slow-{STEPS}steps-1"
+    assert run_trial(trial, tmp_path, TERMS)["protocol"]["motion"] == "static"
+    run = open_run(trial.folder(tmp_path))
+    assert run.preset.optimizer.means == (1e-5, 1e-5) and run.preset == trial.options(TERMS)
+
+
+def test_two_presets_of_one_name_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="two presets are called 'dnerf'"):
+        all_trials([tmp_path], ["dnerf", tmp_path / "dnerf.yaml"], ["2m"], [0])
 
 
 @pytest.mark.parametrize(

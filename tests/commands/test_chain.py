@@ -191,7 +191,10 @@ def test_eval_measures_every_frame(gsdmsr: Gsdmsr, run: Path) -> None:
     for net in ("alex", "squeeze", "vgg"):
         entry = document["aggregate"][f"lpips_{net}"]
         assert entry["value"] is None and entry["reason"] and entry["searched"]
-    assert document["aggregate_train"]["frames"] == 12
+    assert {name: own["frames"] for name, own in document["splits"].items()} == {
+        "test": 4, "train": 12, "val": 3
+    }  # fmt: skip
+    assert document["splits"]["test"]["psnr"] == document["aggregate"]["psnr"]
     assert document["speed"]["fps_raster"] > 0 and document["speed"]["fps"] > 0
     sizes = document["storage"]
     assert sizes["checkpoint_bytes"] == (run / "checkpoint.safetensors").stat().st_size
