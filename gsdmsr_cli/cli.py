@@ -272,6 +272,29 @@ def scenes(
     command.run(folders, out, presets or ["dnerf"], lengths, seed or [0], terms, as_json)
 
 
+@benchmark_app.command()
+def resume(
+    folder: Annotated[Path, typer.Argument(metavar="SCENE", help="Scene folder.")],
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder of the runs.")],
+    preset: Annotated[str, typer.Option(metavar="NAME", help="Preset.")] = "dnerf",
+    steps: Annotated[int, typer.Option(min=1, metavar="N", help="Steps of a training.")] = 600,
+    downscale: Annotated[
+        int, typer.Option(min=1, metavar="N", help="Divide both sides of pictures by N.")
+    ] = 4,
+    kills: Annotated[int, typer.Option(min=1, metavar="N", help="Trainings to kill.")] = 20,
+    seed: Annotated[int, typer.Option(min=0, metavar="N", help="Seed of the moments.")] = 0,
+    overrides: Annotated[
+        list[str] | None, typer.Option("--set", metavar="a.b=v", help="One option; repeatable.")
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Kill trainings at random moments, resume them, and compare how they end."""
+    from gsdmsr_cli.commands import benchmark_resume as command
+
+    asked = [f"training.steps={steps}", f"data.downscale={downscale}", *(overrides or [])]
+    command.run(folder, out, preset, asked, kills, seed, as_json)
+
+
 # The command-line errors of typer share this base, which typer does not export by name.
 _CommandLineError = cast(type[typer.BadParameter], typer.BadParameter.__base__)
 

@@ -131,12 +131,12 @@ def run_trial(trial: Trial, root: Path, terms: Terms) -> dict[str, Any]:
         how = "--overwrite" if saved is None else "--resume"
         places = ["--data", str(trial.scene), "--out", str(folder)]
         kind = "--config" if isinstance(trial.preset, Path) else "--preset"
-        _gsdmsr("train", *places, kind, str(trial.preset), *settings, how)
+        call("train", *places, kind, str(trial.preset), *settings, how)
         saved = None
     report = folder / "eval" / "metrics.json"
     if saved is None or not _is_report_of(report, saved.step, terms):
         weights = ["--lpips-weights", str(terms.lpips_weights)] if terms.lpips_weights else []
-        _gsdmsr("eval", str(folder), "--split", terms.split, "--data", str(trial.scene), *weights)
+        call("eval", str(folder), "--split", terms.split, "--data", str(trial.scene), *weights)
     return read_json(report)
 
 
@@ -159,8 +159,13 @@ def _is_report_of(path: Path, step: int, terms: Terms) -> bool:
     return found == wanted and about["checkpoint_step"] == step
 
 
-def _gsdmsr(*arguments: str) -> None:
-    """Run a command of ours; what it shows goes to stderr, and Ctrl-C is handed on to it."""
+def call(*arguments: str) -> None:
+    """Run a command of ours; what it shows goes to stderr, and Ctrl-C is handed on to it.
+
+    Raises:
+        GsdmsrError: it has failed; its own message stands above.
+        KeyboardInterrupt: Ctrl-C has ended it.
+    """
     command = [sys.executable, "-m", "gsdmsr_cli.cli", *arguments]
     # In a session of its own, or a terminal would interrupt it as well: a second Ctrl-C, at which
     # a training no longer waits to save what it has.

@@ -33,8 +33,8 @@ class Commands:
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.lines: list[tuple[str, ...]] = []
-        self.true = trials._gsdmsr
-        monkeypatch.setattr(trials, "_gsdmsr", self)
+        self.true = trials.call
+        monkeypatch.setattr(trials, "call", self)
 
     def __call__(self, *arguments: str) -> None:
         self.lines.append(arguments)
@@ -157,7 +157,7 @@ def test_a_command_that_fails_ends_the_trial(
     tiny_scene: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     with pytest.raises(GsdmsrError, match="gsdmsr eval has failed with exit code 3"):
-        trials._gsdmsr("eval", str(tmp_path / "nothing"))
+        trials.call("eval", str(tmp_path / "nothing"))
     assert "not a run folder" in capfd.readouterr().err
 
 

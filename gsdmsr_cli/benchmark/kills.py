@@ -1,0 +1,105 @@
+"""Kills trainings at random moments and goes on: do they end where one left alone ends?"""
+
+from __future__ import annotations
+
+import random
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from gsdmsr_cli.benchmark.trials import call
+from gsdmsr_cli.errors import DataError, GsdmsrError
+from gsdmsr_cli.run import Checkpoint, is_run, open_run
+
+OFTEN = "training.checkpoint_minutes=0.02"
+"""A checkpoint a second, so that kills fall into the writing of one as well."""
+
+
+@dataclass(frozen=True)
+class Kill:
+    """What became of a training that was killed.
+
+    Attributes:
+        after_s: wall time from its start, loading included, to the SIGKILL [s].
+        step: of the checkpoint it went on from; None if it had to begin anew.
+        identical: whether it ended bit by bit like the one that was left alone.
+    """
+
+    after_s: float
+    step: int | None
+    identical: bool
+
+
+def survive(
+    options: Sequence[str], root: Path, kills: int, seed: int, tell: Callable[[Kill], None]
+) -> list[Kill]:
+    """Train once undisturbed, then ``kills`` times with a SIGKILL, and compare the ends.
+
+    Args:
+        options: of ``gsdmsr train``, all but ``--out``; their length must be a number of steps.
+        root: folder of the runs.
+        kills: how many trainings to kill, each at a moment chosen evenly from the first's duration.
+        seed: of those moments.
+        tell: called after each.
+
+    Raises:
+        DataError: the folder ``root`` is in use.
+        GsdmsrError: a training has failed by itself.
+    """
+    if root.exists() and any(root.iterdir()):
+        raise DataError(f"{root}: is not empty; choose another --out, or remove it")
+    line, moments = [*options, "--set", OFTEN], random.Random(seed)
+    began = time.perf_counter()
+    call("train", *line, "--out", str(root / "undisturbed"))
+    duration = time.perf_counter() - began
+    expected = open_run(root / "undisturbed").load()
+    found = []
+    for number in range(kills):
+        folder, after_s = root / f"killed-{number}", moments.uniform(0, duration)
+        _train_and_kill([*line, "--out", str(folder)], after_s)
+        step = _saved_step(folder)
+        how = ["--overwrite"] if step is None else ["--resume"]
+        call("train", *line, "--out", str(folder), *how)
+        identical = same(open_run(folder).load(), expected)
+        found.append(Kill(after_s, step, identical))
+        tell(found[-1])
+    return found
+
+
+def _train_and_kill(line: Sequence[str], after_s: float) -> None:
+    command = [sys.executable, "-m", "gsdmsr_cli.cli", "train", *line]
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    try:
+        code = process.wait(timeout=after_s)
+    except subprocess.TimeoutExpired:
+        code = 0
+    finally:
+        process.kill()  # its helpers notice, and end
+        process.wait()
+    if code:
+        raise GsdmsrError(f"gsdmsr train has failed by itself, with exit code {code}")
+
+
+def _saved_step(folder: Path) -> int | None:
+    if not is_run(folder) or not open_run(folder).checkpoint_path.is_file():
+        return None
+    return open_run(folder).load().step
+
+
+def same(found: Checkpoint, expected: Checkpoint) -> bool:
+    """Tell whether two checkpoints are the same in all but the wall time that they took."""
+    alike = (found.step, found.state) == (expected.step, expected.state)
+    names = found.tensors.keys() == expected.tensors.keys()
+    if not (alike and names):
+        return False
+    return all(_bits(t) == _bits(expected.tensors[name]) for name, t in found.tensors.items())
+
+
+def _bits(tensor: Tensor) -> tuple[torch.dtype, torch.Size, bytes]:
+    return tensor.dtype, tensor.shape, tensor.contiguous().numpy().tobytes()

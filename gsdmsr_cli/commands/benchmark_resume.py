@@ -1,0 +1,71 @@
+"""``gsdmsr benchmark resume``: kills trainings at random moments and compares how they end."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+
+from rich.console import Console
+from rich.table import Table
+
+from gsdmsr_cli.benchmark.kills import Kill, survive
+from gsdmsr_cli.errors import GsdmsrError
+from gsdmsr_cli.formats import read_scene
+from gsdmsr_cli.preset import load_preset
+
+SCHEMA = 1
+
+
+def run(
+    scene: Path,
+    out: Path,
+    preset: str,
+    overrides: Sequence[str],
+    kills: int,
+    seed: int,
+    as_json: bool,
+) -> None:
+    """Train once undisturbed and ``kills`` times with a SIGKILL, and print what came of it.
+
+    Raises:
+        UsageError: a preset or an option does not exist.
+        DataError: the scene or the folder cannot be used.
+        GsdmsrError: a training has failed, or a killed one has ended otherwise than the first.
+    """
+    read_scene(scene)
+    load_preset(preset, None, overrides)
+    options = ["--data", str(scene), "--preset", preset]
+    options += [part for override in overrides for part in ("--set", override)]
+    console = Console(stderr=True)
+
+    def tell(kill: Kill) -> None:
+        said = "identical" if kill.identical else "DIFFERENT"
+        console.out(f"killed after {kill.after_s:.1f} s, {_source(kill)}: {said}", highlight=False)
+
+    found = survive(options, out, kills, seed, tell)
+    if as_json:
+        document = {"schema": SCHEMA, "kills": [asdict(kill) for kill in found]}
+        sys.stdout.write(json.dumps(document) + "\n")
+    else:
+        Console().print(_table(found))
+    different = sum(not kill.identical for kill in found)
+    if different:
+        raise GsdmsrError(
+            f"{different} of {kills} killed trainings have ended otherwise than the undisturbed "
+            f"one; all are left in {out}"
+        )
+
+
+def _source(kill: Kill) -> str:
+    return "begun anew" if kill.step is None else f"resumed from step {kill.step}"
+
+
+def _table(found: Sequence[Kill]) -> Table:
+    table = Table("killed after", "then", "end")
+    for kill in found:
+        end = "identical" if kill.identical else "different"
+        table.add_row(f"{kill.after_s:.1f} s", _source(kill), end)
+    return table
