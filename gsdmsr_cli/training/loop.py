@@ -13,6 +13,7 @@ from types import FrameType
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from gsdmsr_cli.evaluation.metrics import PSNR_CAP, psnr, quantize
 from gsdmsr_cli.run import Run
@@ -37,6 +38,8 @@ class Report:
         progress: in [0, 1].
         loss: mean over the steps since the last report, or None if none was finite.
         splats: number of splats.
+        salient: share of them that the optimiser attends to in full; 1 without a gate.
+        still: share of them that stand still.
         ms_per_step: mean wall time since the last report [ms].
         psnr: of the watched view, rounded to 8 bits [dB], or None if it is not a number.
         split: which split the watched view belongs to, "val" or, in scenes without, "train".
@@ -47,6 +50,8 @@ class Report:
     progress: float
     loss: float | None
     splats: int
+    salient: float
+    still: float
     ms_per_step: float
     psnr: float | None
     split: str
@@ -64,6 +69,8 @@ class Report:
             "progress": round(self.progress, 5),
             "loss": self.loss,
             "splats": self.splats,
+            "salient": round(self.salient, 4),
+            "still": round(self.still, 4),
             "ms_per_step": round(self.ms_per_step, 3),
             f"{self.split}_psnr": self.psnr,
         }
@@ -146,6 +153,8 @@ class _Watch:
             progress=clock.progress,
             loss=sum(finite) / len(finite) if finite else None,
             splats=len(self.trainer.model.splats),
+            salient=_share(self.trainer.saliency.high),
+            still=_share(self.trainer.model.still),
             ms_per_step=1000 * (clock.elapsed - self.elapsed) / len(self.losses),
             psnr=self._psnr(),
             split=self.view.split,
@@ -161,6 +170,10 @@ class _Watch:
         frame = draw(model, camera, view.time, observer.engine, observer.background)
         value = psnr(quantize(frame.rgb), target.permute(1, 2, 0) / 255)
         return None if math.isnan(value) else min(value, PSNR_CAP)
+
+
+def _share(rows: Tensor) -> float:
+    return float(rows.double().mean())
 
 
 @contextmanager
