@@ -295,6 +295,25 @@ def resume(
     command.run(folder, out, preset, asked, kills, seed, as_json)
 
 
+@benchmark_app.command()
+def still(
+    run: Annotated[Path, typer.Argument(metavar="RUN", help="Run folder.")],
+    below: Annotated[
+        list[float] | None,
+        typer.Option(metavar="X", help="Motion saliency; repeatable. [default: 0.1 0.3 1 3]"),
+    ] = None,
+    split: Annotated[Literal["test", "val"], typer.Option(help="Views to compare.")] = "val",
+    data: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Where the data lies now, if elsewhere.")
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Let what hardly moves stand still, and measure PSNR and frames a second."""
+    from gsdmsr_cli.commands import benchmark_still as command
+
+    command.run(run, below or [0.1, 0.3, 1.0, 3.0], split, data, as_json)
+
+
 # The command-line errors of typer share this base, which typer does not export by name.
 _CommandLineError = cast(type[typer.BadParameter], typer.BadParameter.__base__)
 

@@ -19,3 +19,8 @@ def progress_bar(description: str) -> Iterator[Tell]:
     with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
         task = progress.add_task(description, total=None)
         yield lambda done, total: progress.update(task, completed=done, total=total)
+
+
+def part_of(tell: Tell, before: int, total: int) -> Callable[[int], None]:
+    """Return what tells of a part of the work, of which so much was done before."""
+    return lambda done: tell(before + done, total)

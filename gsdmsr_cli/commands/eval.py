@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Mapping, Sequence
-from functools import partial
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +13,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from gsdmsr_cli import machine
-from gsdmsr_cli.commands._progress import progress_bar
+from gsdmsr_cli.commands._progress import part_of, progress_bar
 from gsdmsr_cli.commands._trained import Trained, open_trained
 from gsdmsr_cli.errors import ThresholdError, UsageError, nearest
 from gsdmsr_cli.evaluation import protocol
@@ -131,13 +130,9 @@ def _score_splits(
         for name, own_views in chosen.items():
             before, own = sum(map(len, scored.values())), nets if name == split else {}
             scored[name] = protocol.score_views(
-                trained.studio, own_views, own, partial(_tell_more, tell, before, total)
+                trained.studio, own_views, own, part_of(tell, before, total)
             )
     return scored
-
-
-def _tell_more(tell: Callable[[int, int], None], before: int, total: int, done: int) -> None:
-    tell(before + done, total)
 
 
 def _mean(scored: Scored) -> protocol.Scores:

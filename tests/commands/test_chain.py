@@ -203,6 +203,23 @@ def test_eval_measures_every_frame(gsdmsr: Gsdmsr, run: Path) -> None:
     assert document["training"]["steps"] == STEPS
 
 
+def test_benchmark_still_compares_thresholds(gsdmsr: Gsdmsr, run: Path) -> None:
+    """At the smallest nothing stands still, at the largest everything does."""
+    line = "benchmark", "still", run, "--split", "test"
+    ended = gsdmsr(*line, "--below", "1e-9", "--below", "1e9", "--json")
+    assert ended.code == 0 and ended.err == ""
+    document = document_of(ended)
+    report = document_of(gsdmsr("eval", run, "--json"))
+    trained, none, whole = document["rows"]
+    assert [row["below"] for row in document["rows"]] == [0, 1e-9, 1e9]
+    assert [row["still"] for row in document["rows"]] == [0, 0, 1]
+    assert trained["psnr"] == none["psnr"] == report["aggregate"]["psnr"] != whole["psnr"]
+    assert trained["ratio"] == 1 and whole["fps"] > 0
+    assert "as trained" in gsdmsr(*line, "--below", "1").out
+    refused = gsdmsr(*line, "--below", "0")
+    assert refused.code == 2 and refused.err.count("\n") == 1
+
+
 def test_eval_takes_another_split_background_and_size(gsdmsr: Gsdmsr, run: Path) -> None:
     line = "eval", run, "--json", "--split", "val", "--background", "black", "--downscale", 2
     document = document_of(gsdmsr(*line))

@@ -1,0 +1,98 @@
+"""``gsdmsr benchmark still``: what a run would gain and lose if what hardly moves stood still."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+from gsdmsr_cli.commands._progress import part_of, progress_bar
+from gsdmsr_cli.commands._trained import Trained, open_trained
+from gsdmsr_cli.errors import UsageError
+from gsdmsr_cli.evaluation import protocol
+from gsdmsr_cli.evaluation.speed import measure_speed
+from gsdmsr_cli.model import Model
+from gsdmsr_cli.scene import View
+from gsdmsr_cli.training.stillness import motion_saliency
+
+SCHEMA = 1
+
+ROUNDS = 3
+"""How often each model's speed is measured, in turns, so that a busy machine disturbs all alike."""
+
+
+def run(
+    run_folder: Path, below: Sequence[float], split: str, data: Path | None, as_json: bool
+) -> None:
+    """Print share of still splats, PSNR and frames a second for each threshold, and without.
+
+    Raises:
+        UsageError: a threshold is not above 0.
+        DataError: the run or its data cannot be used.
+    """
+    for threshold in below:
+        if not threshold > 0:
+            raise UsageError(f"--below {threshold}: must be above 0")
+    trained = open_trained(run_folder, data)
+    views = trained.scene.split(split)
+    models = {0.0: trained.studio.model} | {own: _settled(trained, own) for own in below}
+    speeds = _speeds(trained, models, views)
+    rows, total = [], len(models) * len(views)
+    with progress_bar("comparing pictures") as tell:
+        for number, (threshold, model) in enumerate(models.items()):
+            studio, before = replace(trained.studio, model=model), number * len(views)
+            scored = protocol.score_views(studio, views, {}, part_of(tell, before, total))
+            rows.append(
+                {
+                    "below": threshold,
+                    "still": float(model.still.double().mean()),
+                    "psnr": protocol.average([scores for _, scores in scored])["psnr"],
+                    "fps": speeds[threshold],
+                    "ratio": speeds[threshold] / speeds[0.0],
+                }
+            )
+    if as_json:
+        document = {"schema": SCHEMA, "split": split, "rows": rows}
+        sys.stdout.write(json.dumps(document) + "\n")
+    else:
+        Console().print(_table(rows, split))
+
+
+def _settled(trained: Trained, below: float) -> Model:
+    """Return the run's model with all splats still whose motion saliency lies below."""
+    model, _ = trained.run.load_model()
+    saliency, mean = motion_saliency(model)
+    model.settle(saliency < below, mean)
+    return model
+
+
+def _speeds(
+    trained: Trained, models: Mapping[float, Model], views: Sequence[View]
+) -> dict[float, float]:
+    """Return the frames a second of each model."""
+    studio = trained.studio
+    shots = [(studio.pictures.camera(view), view.time) for view in views]
+    found: dict[float, list[float]] = {threshold: [] for threshold in models}
+    for _ in range(ROUNDS):
+        for threshold, model in models.items():
+            speed = measure_speed(model, shots, studio.engine, studio.background)
+            found[threshold].append(speed.fps)
+    return {threshold: median(rates) for threshold, rates in found.items()}
+
+
+def _table(rows: Sequence[Mapping[str, Any]], split: str) -> Table:
+    table = Table("still below", "still", f"psnr ({split})", "frames a second", "ratio")
+    for row in rows:
+        psnr = "none" if row["psnr"] is None else f"{row['psnr']:.2f}"
+        table.add_row(
+            f"{row['below']:g}" if row["below"] else "as trained",
+            f"{100 * row['still']:.1f} %", psnr, f"{row['fps']:.0f}", f"{row['ratio']:.2f}",
+        )  # fmt: skip
+    return table
