@@ -15,7 +15,7 @@ HERE = Path(__file__).parent
 
 def _sources_hash() -> str:
     digest = hashlib.sha256()
-    for path in sorted(HERE.glob("*.py")):
+    for path in (*sorted(HERE.glob("*.py")), HERE.parent / "splatting_constants.py"):
         digest.update(path.read_bytes())
     return digest.hexdigest()[:16]
 
@@ -24,7 +24,7 @@ def _cache_folder() -> Path:
     """Folder of compiled kernels: beside the sources if that is writable, else the user's cache.
 
     Numba alone would not recompile a kernel when a helper in another module changes, so the
-    folder's name is a hash of all kernel sources.
+    folder's name is a hash of all kernel sources and of the constants compiled into them.
     """
     beside = HERE / "__pycache__"
     try:
