@@ -197,7 +197,9 @@ class DensityOptions:
     """When and where splats are cloned, split, pruned and reset (3DGS, Kerbl et al. 2023).
 
     Attributes:
-        every: interval of growing and pruning [steps].
+        every: least interval of growing and pruning [steps].
+        rounds: most times that splats grow, spread evenly over progress: a longer training has
+            more steps in between, not more splats.
         start: first step at which it happens [steps].
         until: progress at which it ends.
         gradient: mean norm of the screen-space gradient above which a splat grows [1 / NDC unit].
@@ -209,6 +211,7 @@ class DensityOptions:
     """
 
     every: int = 100
+    rounds: int = 1000
     start: int = 300
     until: float = 0.35
     gradient: float = 9e-4
@@ -219,7 +222,7 @@ class DensityOptions:
     cap: int = 100000
 
     def __post_init__(self) -> None:
-        _require_at_least(self, 1, "every", "cap")
+        _require_at_least(self, 1, "every", "rounds", "cap")
         _require_at_least(self, 0, "start")
         _require_progress(self, "until")
         _require_positive(self, "gradient", "split_scale", "prune_scale")

@@ -84,7 +84,7 @@ class Trainer:
         self.average = averaging.Average()
         self.clock = new_clock(preset.training)
         self._queue: list[int] = []
-        self._resets = 0
+        self._rounds = self._resets = 0
         self._moving = False
         self._skipped = 0
 
@@ -235,16 +235,16 @@ class Trainer:
             self.optimizer.calm(self.model.held_by_motion(), woken[~self.model.still])
 
     def _control_density(self, progress: float) -> None:
-        options, step = self.preset.density, self.clock.step
-        growing = progress < options.until
-        if step >= options.start and step % (options.every if growing else PRUNE_EVERY) == 0:
+        options = self.preset.density
+        if self._density_is_due(progress):
+            growing = progress < options.until
             rows, fresh, grown = grow_and_prune(
                 self.model.splats, self.statistics, options, self.radius, growing, self.generator
             )
             if not len(rows):
                 raise GsdmsrError(
-                    f"no splats are left at step {step}; lower density.prune_opacity or check "
-                    "that cameras and pictures belong together"
+                    f"no splats are left at step {self.clock.step}; lower density.prune_opacity or "
+                    "check that cameras and pictures belong together"
                 )
             held = self.model.take(rows)
             with torch.no_grad():
@@ -262,6 +262,18 @@ class Trainer:
             self.optimizer.forget(STORED_AS + "logit_opacities")
             self.average.forget()
             self.saliency.pardon(torch.ones(len(self.model.splats), dtype=torch.bool))
+
+    def _density_is_due(self, progress: float) -> bool:
+        """Tell whether to grow and prune, or only to prune, after this step."""
+        options, step = self.preset.density, self.clock.step
+        if step < options.start:
+            return False
+        if progress >= options.until:
+            return step % PRUNE_EVERY == 0
+        if step % options.every or progress * options.rounds < self._rounds * options.until:
+            return False
+        self._rounds += 1
+        return True
 
     def _follow(self, names: Sequence[str], rows: Tensor, fresh: Tensor) -> None:
         """Resize what is kept beside the named tensors of the model."""
@@ -309,6 +321,7 @@ class Trainer:
         tensors["generator"] = self.generator.get_state()
         state = {
             "queue": self._queue,
+            "rounds": self._rounds,
             "resets": self._resets,
             "moving": self._moving,
             "adam_steps": self.optimizer.steps,
@@ -340,7 +353,8 @@ class Trainer:
         self.saliency.restore(_below(_SALIENCY, tensors))
         self.tiles.restore(_below(_TILES, tensors))
         self.generator.set_state(tensors["generator"])
-        self._queue, self._resets = list(state["queue"]), int(state["resets"])
+        self._queue = list(state["queue"])
+        self._rounds, self._resets = int(state["rounds"]), int(state["resets"])
         self._moving = bool(state["moving"])
         self.clock.step, self.clock.before = checkpoint.step, checkpoint.elapsed
 

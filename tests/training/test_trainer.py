@@ -29,6 +29,7 @@ from gsdmsr_cli.raster import best_engine
 from gsdmsr_cli.splats import Splats
 from gsdmsr_cli.training import look
 from gsdmsr_cli.training import trainer as trainer_module
+from gsdmsr_cli.training.density import grow_and_prune
 from gsdmsr_cli.training.trainer import PATIENCE, Trainer
 
 every_motion = pytest.mark.parametrize("motion", plugins.names(motions.__name__))
@@ -175,6 +176,27 @@ def test_the_motion_starts_without_the_momentum_of_the_static_phase(tiny_scene: 
     after(trainer, 3)
     # the second moments, which say how large a step may be, stay
     assert forgotten == [(f"splats.{name}", False) for name in SPLATS]
+
+
+@pytest.mark.parametrize(("steps", "every"), [(40, 1), (40, 2), (120, 2), (40, 5)])
+def test_a_longer_training_grows_no_more_often(
+    tiny_scene: Path, monkeypatch: pytest.MonkeyPatch, steps: int, every: int
+) -> None:
+    """Six times up to half of the progress, or every fifth of 20 steps."""
+    grown: list[int] = []
+
+    def remember(*arguments: Any) -> Any:
+        if arguments[4]:
+            grown.append(trainer.clock.step)
+        return grow_and_prune(*arguments)
+
+    monkeypatch.setattr(trainer_module, "grow_and_prune", remember)
+    options = (f"training.steps={steps}", f"density.every={every}", "density.start=0")
+    preset = preset_of(*options, "density.rounds=6", "density.until=0.5", "density.reset_at=[]")
+    trainer = trainer_of(tiny_scene, preset)
+    after(trainer, steps)
+    assert len(grown) == min(6, steps // 2 // every)
+    assert all(step % every == 0 for step in grown) and grown[-1] > steps / 3
 
 
 def test_the_motion_is_told_where_the_first_splats_are(tiny_scene: Path) -> None:
