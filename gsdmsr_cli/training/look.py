@@ -164,7 +164,7 @@ def draw_and_compare(
         loss = unweighted = photometric_loss(frame.rgb, target, ssim_weight)
     else:
         errors = errors * (tile_weights > 0)
-        loss = (errors * tile_weights).sum() / target.numel()
+        loss = ((errors * tile_weights).sum() / target.numel()).to(frame.rgb.dtype)
         unweighted = errors.sum() / target.numel()
     (on_screen,) = torch.autograd.grad(unweighted, frame.means2d, retain_graph=True)
     return Comparison(loss, on_screen, None if errors is None else errors.detach())

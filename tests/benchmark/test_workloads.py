@@ -58,13 +58,13 @@ def test_a_step_takes_all_gradients_and_moves_nothing(
     run = workloads.training_step(32, 200, motion)
     run()
     run()
-    model, before, (loss, gradients, on_screen) = seen[0]
-    assert loss > 0 and on_screen.shape == (200, 2)
-    for (name, tensor), gradient in zip(model.tensors().items(), gradients, strict=True):
+    model, before, look = seen[0]
+    assert look.loss > 0 and look.on_screen.shape == (200, 2)
+    for (name, tensor), gradient in zip(model.tensors().items(), look.gradients, strict=True):
         assert gradient is not None and gradient.isfinite().all(), name
         assert torch.equal(tensor, before[name]), name
         assert tensor.grad is None
-    assert seen[1][2][0] == loss
+    assert seen[1][2].loss == look.loss
 
 
 def test_a_target_has_a_loss_at_nearly_every_pixel() -> None:
