@@ -63,11 +63,12 @@ def survive(
     for number in range(kills):
         folder, after_s = root / f"killed-{number}", moments.uniform(0, duration)
         _train_and_kill([*line, "--out", str(folder)], after_s)
-        step = _saved_step(folder)
-        how = ["--overwrite"] if step is None else ["--resume"]
-        call("train", *line, "--out", str(folder), *how)
+        saved = _saved(folder)
+        if saved is None or saved.progress < 1:
+            how = "--overwrite" if saved is None else "--resume"
+            call("train", *line, "--out", str(folder), how)
         identical = same(open_run(folder).load(), expected)
-        found.append(Kill(after_s, step, identical))
+        found.append(Kill(after_s, None if saved is None else saved.step, identical))
         tell(found[-1])
     return found
 
@@ -86,10 +87,10 @@ def _train_and_kill(line: Sequence[str], after_s: float) -> None:
         raise GsdmsrError(f"gsdmsr train has failed by itself, with exit code {code}")
 
 
-def _saved_step(folder: Path) -> int | None:
+def _saved(folder: Path) -> Checkpoint | None:
     if not is_run(folder) or not open_run(folder).checkpoint_path.is_file():
         return None
-    return open_run(folder).load().step
+    return open_run(folder).load()
 
 
 def same(found: Checkpoint, expected: Checkpoint) -> bool:

@@ -201,9 +201,13 @@ def test_comparing_is_drawing_and_then_comparing(placed: Placed, name: str, ssim
 
 @pytest.mark.parametrize("name", CASES)
 def test_tiles_count_by_their_weights(placed: Placed, name: str) -> None:
-    """Weights enter after the sum over a tile or before it; terms that cancel round otherwise."""
+    """Weights enter after the sum over a tile or before it; terms that cancel round otherwise.
+
+    By far less than a gradient may be off, but by more than what is summed in the same order.
+    """
     for found, expected in zip(*compared(placed, name, 0.0, chosen=True), strict=True):
-        assert float((found - expected).norm()) <= 1e-5 * float(expected.norm()) + 1e-9
+        error, size = (found - expected).detach().norm(), expected.detach().norm()
+        assert float(error) <= 0.1 * BACKWARD * float(size) + 1e-9
 
 
 def test_tiles_cannot_be_weighted_where_ssim_counts(placed: Placed) -> None:
