@@ -1,4 +1,4 @@
-"""The splats a training starts from: the scene's points, or random ones."""
+"""What a training starts from: the scene's points or random ones, and the facts for its motion."""
 
 from __future__ import annotations
 
@@ -7,7 +7,9 @@ import math
 import torch
 from torch import Tensor
 
+from gsdmsr_cli.fields.planes import Box, Corner
 from gsdmsr_cli.geometry import SH_C0
+from gsdmsr_cli.motion import Facts
 from gsdmsr_cli.pictures import Pictures
 from gsdmsr_cli.preset import SplatOptions
 from gsdmsr_cli.scene import Scene
@@ -15,6 +17,10 @@ from gsdmsr_cli.splats import Splats
 from gsdmsr_cli.training.silhouettes import sample_points
 
 NEIGHBOURS = 3
+
+STRAYS, MARGIN = 0.01, 0.075
+"""Share of the first splats that may lie beyond each side of the motion's box, and what is added
+to the box on each side, in units of its edge."""
 
 
 def initial_splats(
@@ -61,3 +67,26 @@ def _spacing(means: Tensor, bound: float) -> Tensor:
         nearest = torch.cdist(chunk, means).topk(count + 1, largest=False).values[:, 1:]
         squares.append(nearest.square().mean(dim=1))
     return torch.cat(squares).clamp(min=1e-7).sqrt()
+
+
+def facts_of(scene: Scene, splats: Splats) -> Facts:
+    """Return what a motion may know of the scene, which ``splats`` are about to represent."""
+    return Facts(scene.bound, _box(splats.means, scene.bound), len(scene.train_times))
+
+
+def _box(means: Tensor, bound: float) -> Box:
+    """Return the box that holds all but the outermost of the means, and some more.
+
+    4D-GS's code gives its grid the box of the first cloud as well. Random starts have strays,
+    hence the quantiles; what ends up outside moves like the border.
+    """
+    means = means.double()
+    lower, upper = means.quantile(STRAYS, 0), means.quantile(1 - STRAYS, 0)
+    half = ((upper - lower) * (0.5 + MARGIN)).clamp(min=0.01 * bound)
+    centre = (lower + upper) / 2
+    return _corner(centre - half), _corner(centre + half)
+
+
+def _corner(point: Tensor) -> Corner:
+    x, y, z = point.tolist()
+    return x, y, z

@@ -11,18 +11,17 @@ import torch
 from torch import Tensor
 
 from gsdmsr_cli.errors import GsdmsrError
-from gsdmsr_cli.fields.planes import Box, Corner
 from gsdmsr_cli.model import MOVED_BY, STILL, STORED, STORED_AS, Model, load_model
-from gsdmsr_cli.motion import Facts, start_motion
+from gsdmsr_cli.motion import start_motion
 from gsdmsr_cli.pictures import Pictures
 from gsdmsr_cli.preset import Preset
 from gsdmsr_cli.raster import Engine
 from gsdmsr_cli.run import Checkpoint
 from gsdmsr_cli.scene import Scene, View
-from gsdmsr_cli.splats import NAMES, Splats
+from gsdmsr_cli.splats import NAMES
 from gsdmsr_cli.training import averaging
 from gsdmsr_cli.training.density import DensityStatistics, grow_and_prune, reset_opacities
-from gsdmsr_cli.training.initial import initial_splats
+from gsdmsr_cli.training.initial import facts_of, initial_splats
 from gsdmsr_cli.training.look import Look, Observer, Stage
 from gsdmsr_cli.training.optimizer import Adam, Gate
 from gsdmsr_cli.training.saliency import Saliency, step_saliency
@@ -36,10 +35,6 @@ PENALTY_EVERY = 4
 
 PRUNE_EVERY = 500
 """Interval of pruning alone, once growing has ended [steps]."""
-
-STRAYS, MARGIN = 0.01, 0.075
-"""Share of the first splats that may lie beyond each side of the motion's box, and what is added
-to the box on each side, in units of its edge."""
 
 PATIENCE = 20
 """Consecutive steps without a finite loss after which training gives up."""
@@ -362,29 +357,6 @@ class Trainer:
 def _below(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """Return the tensors whose names begin with the prefix, without it."""
     return {n.removeprefix(prefix): t for n, t in tensors.items() if n.startswith(prefix)}
-
-
-def facts_of(scene: Scene, splats: Splats) -> Facts:
-    """Return what a motion may know of the scene, which ``splats`` are about to represent."""
-    return Facts(scene.bound, _box(splats.means, scene.bound), len(scene.train_times))
-
-
-def _box(means: Tensor, bound: float) -> Box:
-    """Return the box that holds all but the outermost of the means, and some more.
-
-    4D-GS's code gives its grid the box of the first cloud as well. Random starts have strays,
-    hence the quantiles; what ends up outside moves like the border.
-    """
-    means = means.double()
-    lower, upper = means.quantile(STRAYS, 0), means.quantile(1 - STRAYS, 0)
-    half = ((upper - lower) * (0.5 + MARGIN)).clamp(min=0.01 * bound)
-    centre = (lower + upper) / 2
-    return _corner(centre - half), _corner(centre + half)
-
-
-def _corner(point: Tensor) -> Corner:
-    x, y, z = point.tolist()
-    return x, y, z
 
 
 def _sum(parts: Sequence[Tensor | None]) -> Tensor | None:

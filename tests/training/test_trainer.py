@@ -27,7 +27,7 @@ from gsdmsr_cli.errors import GsdmsrError
 from gsdmsr_cli.frame import Frame
 from gsdmsr_cli.raster import best_engine
 from gsdmsr_cli.splats import Splats
-from gsdmsr_cli.training import look
+from gsdmsr_cli.training import initial, look
 from gsdmsr_cli.training import trainer as trainer_module
 from gsdmsr_cli.training.density import grow_and_prune
 from gsdmsr_cli.training.trainer import PATIENCE, Trainer
@@ -208,8 +208,8 @@ def test_the_motion_is_told_where_the_first_splats_are(tiny_scene: Path) -> None
     assert ((upper - lower) < 1.15 * 2.6).all()
     # strays do not stretch the box
     strays = torch.cat([means, torch.full((10, 3), 1e3)])
-    assert torch.tensor(trainer_module._box(strays, 1.3)).abs().max() < 1.5
-    assert torch.tensor(trainer_module._box(means[:1], 1.3)).diff(dim=0).min() > 0.02
+    assert torch.tensor(initial._box(strays, 1.3)).abs().max() < 1.5
+    assert torch.tensor(initial._box(means[:1], 1.3)).diff(dim=0).min() > 0.02
 
 
 def test_every_view_is_seen_before_any_again(tiny_scene: Path) -> None:
