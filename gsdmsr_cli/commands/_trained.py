@@ -50,6 +50,8 @@ def open_trained(
     Raises:
         DataError: the run or its data cannot be used, or do not belong together.
     """
+    # torch's own threads would wait busily between its small operations and take the kernels' cores
+    torch.set_num_threads(1)
     run = open_run(folder)
     model, checkpoint = run.load_model()
     scene = _read_data(run, data)

@@ -18,7 +18,7 @@ from gsdmsr_cli.commands._training_display import TrainingDisplay
 from gsdmsr_cli.errors import UsageError
 from gsdmsr_cli.files import write_json
 from gsdmsr_cli.formats import read_scene
-from gsdmsr_cli.kernels.jit import set_threads, threads
+from gsdmsr_cli.kernels.jit import compile_apart, set_threads, threads
 from gsdmsr_cli.motion import motion_options
 from gsdmsr_cli.pictures import Pictures
 from gsdmsr_cli.preset import BACKGROUNDS, Preset, load_preset
@@ -109,6 +109,8 @@ def _start_work(trainer: Trainer, device: str) -> float:
 
     started = time.perf_counter()
     if device == "cpu":
+        motion = str(trainer.preset.motion["name"])
+        compile_apart(motion, [lambda: warm_up(*given), prepare_helper])
         trainer.hire(prepare_helper)
     warm_up(*given)
     trainer.team.wait()

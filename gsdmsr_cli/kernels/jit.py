@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import ctypes
 import hashlib
+import multiprocessing
 import os
 import sys
+from collections.abc import Callable, Sequence
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -95,6 +97,29 @@ parallel = numba.njit(parallel=True, **_OPTIONS)
 
 inline = numba.njit(inline="always", **{k: v for k, v in _OPTIONS.items() if k != "cache"})
 """Compile a helper into the kernels that call it."""
+
+
+def compile_apart(name: str, works: Sequence[Callable[[], object]]) -> None:
+    """Do all works at once, each in a child process, so that what they compile is in the cache.
+
+    A kernel that a process has compiled itself may round otherwise than the same kernel read from
+    the cache: what has been compiled beside it can have become part of it. So a process whose
+    results are to be those of every later one had better compile nothing. Where processes cannot
+    be forked this does nothing. Nor is anything done again: ``name`` stands for the works.
+    """
+    done = Path(str(numba.config.CACHE_DIR)) / f"compiled-{name}"
+    threads()  # starts the layer of threads, which knows whether one may fork
+    if done.is_file() or not sys.platform.startswith("linux") or not may_fork():
+        return
+    context = multiprocessing.get_context("fork")
+    children = [context.Process(target=work) for work in works]
+    for child in children:
+        child.start()
+    for child in children:
+        child.join()
+    if all(child.exitcode == 0 for child in children):
+        done.parent.mkdir(parents=True, exist_ok=True)
+        done.touch()
 
 
 def set_threads(count: int) -> int:
