@@ -71,7 +71,8 @@ def line_chart(title: str, x_label: str, y_label: str, lines: Iterable[Line]) ->
 def _ticks(values: Sequence[float]) -> list[float]:
     """Return about six round numbers, evenly spaced, that reach from below to above the values."""
     low, high = (min(values), max(values)) if values else (0.0, 1.0)
-    span = max(high - low, 1e-6 * max(abs(low), abs(high))) or 1.0
+    span = max(high - low, 1e-6 * max(abs(low), abs(high)))
+    span = span if span > 1e-12 else 1.0
     power = 10 ** math.floor(math.log10(span / _TICKS))
     step = next(s * power for s in (1, 2, 5, 10, 20) if span / (s * power) <= _TICKS)
     first, last = math.floor(low / step + 1e-9), math.ceil(high / step - 1e-9)

@@ -73,3 +73,8 @@ def test_without_lines_there_are_axes_still() -> None:
     chart = line_chart("t", "x", "y", [Line("a", []), Line("b", [(1.0, 2.0)])])
     assert not paths_of(chart)
     assert ElementTree.fromstring(chart).tag == f"{SVG}svg"
+
+
+def test_values_too_small_to_tell_apart_are_one() -> None:
+    ((_, places),) = paths_of(line_chart("t", "x", "y", [Line("a", [(0.0, 5e-324), (1.0, 0.0)])]))
+    assert len(places) == 2
