@@ -42,7 +42,11 @@ def run(
             raise UsageError(f"--below {threshold}: must be above 0")
     trained = open_trained(run_folder, data)
     views = trained.scene.split(split)
-    models = {0.0: trained.studio.model} | {own: _settled(trained, own) for own in below}
+    saliency, mean = motion_saliency(trained.studio.model)
+    models = {0.0: trained.studio.model}
+    for threshold in below:
+        models[threshold], _ = trained.run.load_model()
+        models[threshold].settle(saliency < threshold, mean)
     speeds = _speeds(trained, models, views)
     rows, total = [], len(models) * len(views)
     with progress_bar("comparing pictures") as tell:
@@ -63,14 +67,6 @@ def run(
         sys.stdout.write(json.dumps(document) + "\n")
     else:
         Console().print(_table(rows, split))
-
-
-def _settled(trained: Trained, below: float) -> Model:
-    """Return the run's model with all splats still whose motion saliency lies below."""
-    model, _ = trained.run.load_model()
-    saliency, mean = motion_saliency(model)
-    model.settle(saliency < below, mean)
-    return model
 
 
 def _speeds(

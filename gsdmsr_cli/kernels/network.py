@@ -190,8 +190,8 @@ def backward(x, weights, biases, outputs, d_y, d_weights, d_biases, d_x, add):
     for block in prange(_BLOCKS):
         after = np.empty(_CHUNK * widest, np.float32)
         before = np.empty(_CHUNK * widest, np.float32)
-        given = np.empty(_CHUNK * widest, np.float32)
-        chosen = np.empty(_CHUNK, np.int64)
+        picked = np.empty(_CHUNK * widest, np.float32)
+        chosen = np.zeros(_CHUNK, np.int64)
         row, last = n * block // _BLOCKS, n * (block + 1) // _BLOCKS
         while row < last:
             rows = 0
@@ -203,6 +203,7 @@ def backward(x, weights, biases, outputs, d_y, d_weights, d_biases, d_x, add):
                     chosen[rows] = row
                     rows += 1
                 row += 1
+            together = rows > 0 and chosen[rows - 1] - chosen[0] == rows - 1
             w_at, b_at, y_at = size, columns, total
             o = widths[layers]
             after[: rows * o] = float32(0)
@@ -214,16 +215,21 @@ def backward(x, weights, biases, outputs, d_y, d_weights, d_biases, d_x, add):
                 w_at, b_at, y_at = w_at - k * o, b_at - o, y_at - n * o
                 source = x_flat if layer == 0 else outputs
                 start = 0 if layer == 0 else y_at - n * k
-                _copy_rows(source, start, x_row if layer == 0 else k, chosen, rows, given, k)
+                pitch = x_row if layer == 0 else k
+                at = start + chosen[0] * pitch
+                if not together:
+                    _copy_rows(source, start, pitch, chosen, rows, picked, k)
+                    source, at, pitch = picked, 0, k
                 _add_rows(after, rows, o, b_flat, block * columns + b_at)
                 _add_product(
-                    given, 0, 1, k, k, after, 0, o, rows, w_flat, block * size + w_at, o, o
-                )
+                    source, at, 1, pitch, k, after, 0, o, rows,
+                    w_flat, block * size + w_at, o, o,
+                )  # fmt: skip
                 if layer > 0 or wanted:
                     before[: rows * k] = float32(0)
                     _add_product(after, 0, o, 1, rows, turned, w_at, k, o, before, 0, k, k)
                 if layer > 0:
-                    _mask(before, given, 0, rows * k)
+                    _mask(before, source, at, rows * k)
                     after, before = before, after
                 elif wanted:
                     _put_rows(before, k, chosen, rows, d_x_flat, x_row, add)

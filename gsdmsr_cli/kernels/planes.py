@@ -9,6 +9,7 @@ linear samples, positions clamped to the border. One call serves all levels.
 
 from __future__ import annotations
 
+import numpy as np
 from numba import float32, prange
 
 from gsdmsr_cli.kernels import simd
@@ -155,6 +156,14 @@ def lookup_backward(
         d_points: (N, 3) out, or (0, 3) if not wanted.
     """
     n, width, d_out = points.shape[0], d_features.shape[1], d_features.reshape(-1)
+    idle = np.empty(n, np.bool_)
+    for i in range(n):
+        idle[i] = True
+        for task in range(shares.shape[0]):
+            d = simd.load(d_out, i * width + task * _LANES)
+            if simd.reduce_max(simd.maximum(d, d * float32(-1))) != float32(0):
+                idle[i] = False
+                break
     for task in prange(shares.shape[0]):
         level, before = 0, 0
         while task >= before + spaces[level].shape[1]:
@@ -171,8 +180,7 @@ def lookup_backward(
             d_space[axis, c] = float32(0)
             d_line[axis, c] = float32(0)
         for i in range(n):
-            d = simd.load(d_out, i * width + task * _LANES)
-            if simd.reduce_max(simd.maximum(d, d * float32(-1))) == float32(0):
+            if idle[i]:
                 if d_points.shape[0] > 0:
                     shares[task, i] = float32(0)
                 continue
@@ -196,6 +204,7 @@ def lookup_backward(
             s_x, by_x = _linear(strips, x, wx)
             s_y, by_y = _linear(strips, y, wy)
             s_z, by_z = _linear(strips, z, wz)
+            d = simd.load(d_out, i * width + task * _LANES)
             d_time = d * (s_x * s_y * s_z)
             d_xy, d_xz, d_yz = d_time * s_xz * s_yz, d_time * s_xy * s_yz, d_time * s_xy * s_xz
             d = d * (s_xy * s_xz * s_yz)
