@@ -11,6 +11,7 @@ from torch import Tensor
 from torch.autograd import Function
 from torch.autograd.function import once_differentiable
 
+from gsdmsr_cli.fields.live import live_rows, spread
 from gsdmsr_cli.kernels import network as kernels
 from gsdmsr_cli.kernels.simd import LANES
 from gsdmsr_cli.tensors import array, has_kernels
@@ -74,16 +75,17 @@ class _Networks(Function):
 
     @staticmethod
     def forward(ctx: Any, x: Tensor, depths: Sequence[int], *tensors: Tensor) -> tuple[Tensor, ...]:
-        ctx.networks, kept, results = [], [], []
+        ctx.networks, ctx.widths, kept, results = [], [], [], []
         for own in _split(tensors, depths):
             layers = tuple(map(array, own[::2])), tuple(map(array, own[1::2]))
             columns = [weight.shape[1] for weight in layers[0]]
-            width = columns[-1] + -columns[-1] % LANES
-            outputs = torch.empty(len(x) * (sum(columns[:-1]) + width))
+            widths = [*columns[:-1], columns[-1] + -columns[-1] % LANES]
+            outputs = torch.empty(len(x) * sum(widths))
             kernels.forward(array(x), *layers, array(outputs))
             ctx.networks.append(layers)
+            ctx.widths.append(widths)
             kept.append(outputs)
-            y = outputs[len(outputs) - len(x) * width :].view(len(x), width)
+            y = outputs[len(outputs) - len(x) * widths[-1] :].view(len(x), widths[-1])
             results.append(y[:, : columns[-1]])
         ctx.depths = depths
         ctx.save_for_backward(x, *kept, *tensors)
@@ -94,6 +96,11 @@ class _Networks(Function):
     def backward(ctx: Any, *d_results: Tensor) -> tuple[Tensor | None, ...]:
         x, *saved = ctx.saved_tensors
         kept, tensors = saved[: len(ctx.depths)], saved[len(ctx.depths) :]
+        count, rows = len(x), live_rows(torch.cat(d_results, dim=1))
+        if rows is not None:
+            x, d_results = x[rows], tuple(d[rows] for d in d_results)
+            laid_out = zip(kept, ctx.widths, strict=True)
+            kept = [_pick(outputs, count, rows, widths) for outputs, widths in laid_out]
         wanted = ctx.needs_input_grad[0]
         d_x = torch.empty_like(x) if wanted else torch.empty(0, 0)
         gradients = [torch.empty_like(tensor) for tensor in tensors]
@@ -103,7 +110,15 @@ class _Networks(Function):
                 array(x), *layers, array(outputs), array(d_result.contiguous()),
                 tuple(map(array, own[::2])), tuple(map(array, own[1::2])), array(d_x), i > 0,
             )  # fmt: skip
+        if wanted and rows is not None:
+            d_x = spread(d_x, rows, count)
         return d_x if wanted else None, None, *gradients
+
+
+def _pick(outputs: Tensor, count: int, rows: Tensor, widths: Sequence[int]) -> Tensor:
+    """Return the rows of all layers' outputs, laid out as ``kernels.forward`` does."""
+    layers = zip(outputs.split([count * width for width in widths]), widths, strict=True)
+    return torch.cat([layer.view(count, width)[rows].flatten() for layer, width in layers])
 
 
 def _split(tensors: Sequence[Tensor], depths: Sequence[int]) -> list[Sequence[Tensor]]:

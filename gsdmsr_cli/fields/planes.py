@@ -12,6 +12,7 @@ from torch import Tensor
 from torch.autograd import Function
 from torch.autograd.function import once_differentiable
 
+from gsdmsr_cli.fields.live import live_rows, spread
 from gsdmsr_cli.kernels import planes as kernels
 from gsdmsr_cli.kernels.simd import LANES
 from gsdmsr_cli.tensors import array, has_kernels
@@ -138,9 +139,9 @@ class _Lookup(Function):
         ctx.columns = sum(plane.shape[1] * LANES for plane in spaces)
         features = torch.empty(len(points), ctx.columns + beside.shape[1])
         features[:, ctx.columns :] = beside
-        where = array(points), _to_cube(box).astype(np.float32), time
-        kernels.lookup(*where, spaces, times, lines, array(features))
-        ctx.where, ctx.spaces, ctx.lines = where, spaces, lines
+        when = _to_cube(box).astype(np.float32), time
+        kernels.lookup(array(points), *when, spaces, times, lines, array(features))
+        ctx.when, ctx.spaces, ctx.lines = when, spaces, lines
         ctx.save_for_backward(points, *tensors)
         return features
 
@@ -148,15 +149,20 @@ class _Lookup(Function):
     @once_differentiable  # type: ignore[untyped-decorator]
     def backward(ctx: Any, d_features: Tensor) -> tuple[Tensor | None, ...]:
         points, *tensors = ctx.saved_tensors
+        count, rows, given = len(points), live_rows(d_features), d_features.contiguous()
+        if rows is not None:
+            points, given = points[rows], given[rows]
         wanted = ctx.needs_input_grad[0]
         d_points = torch.empty_like(points) if wanted else torch.empty(0, 3)
         gradients = [torch.empty_like(tensor) for tensor in tensors]
         shares = np.empty((ctx.columns // LANES, len(d_points), 3), np.float32)
         kernels.lookup_backward(
-            *ctx.where, ctx.spaces, ctx.lines, array(d_features.contiguous()),
+            array(points), *ctx.when, ctx.spaces, ctx.lines, array(given),
             tuple(map(array, gradients[::2])), tuple(map(array, gradients[1::2])),
             tuple(map(np.empty_like, ctx.lines)), shares, array(d_points),
         )  # fmt: skip
+        if wanted and rows is not None:
+            d_points = spread(d_points, rows, count)
         d_beside = d_features[:, ctx.columns :] if ctx.needs_input_grad[1] else None
         return d_points if wanted else None, d_beside, None, None, *gradients
 

@@ -136,42 +136,9 @@ def forward(x, weights, biases, outputs):
                 w_at, b_at, y_at = w_at + k * o, b_at + o, y_at + n * o
 
 
-@inline
-def _is_zero(values, row):
-    zero = True
-    for j in range(values.shape[1]):
-        zero = zero and values[row, j] == float32(0)
-    return zero
-
-
-@inline
-def _copy_rows(source, start, pitch, chosen, rows, target, width):
-    """Copy the first columns of the chosen rows of ``source``, one after another."""
-    for r in range(rows):
-        at = start + chosen[r] * pitch
-        for j in range(0, width, _LANES):
-            simd.store(target, r * width + j, simd.load(source, at + j))
-
-
-@inline
-def _put_rows(source, width, chosen, rows, target, pitch, add):
-    """Set the chosen rows of ``target``, or add to them; columns beyond are 0 or stay."""
-    for r in range(rows):
-        at = chosen[r] * pitch
-        for j in range(0, width, _LANES):
-            value = simd.load(source, r * width + j)
-            if add:
-                value = value + simd.load(target, at + j)
-            simd.store(target, at + j, value)
-        if not add:
-            target[at + width : at + pitch] = float32(0)
-
-
 @parallel
 def backward(x, weights, biases, outputs, d_y, d_weights, d_biases, d_x, add):
     """Write the gradients of weights, biases and inputs.
-
-    Rows whose ``d_y`` is 0 cost nothing: those of splats that nothing is to be learnt from.
 
     Args:
         x, weights, biases, outputs: see ``forward``.
@@ -190,49 +157,37 @@ def backward(x, weights, biases, outputs, d_y, d_weights, d_biases, d_x, add):
     for block in prange(_BLOCKS):
         after = np.empty(_CHUNK * widest, np.float32)
         before = np.empty(_CHUNK * widest, np.float32)
-        picked = np.empty(_CHUNK * widest, np.float32)
-        chosen = np.zeros(_CHUNK, np.int64)
-        row, last = n * block // _BLOCKS, n * (block + 1) // _BLOCKS
-        while row < last:
-            rows = 0
-            while row < last and rows < _CHUNK:
-                if _is_zero(d_y, row):
-                    if wanted and not add:
-                        d_x[row] = float32(0)
-                else:
-                    chosen[rows] = row
-                    rows += 1
-                row += 1
-            together = rows > 0 and chosen[rows - 1] - chosen[0] == rows - 1
+        last = n * (block + 1) // _BLOCKS
+        for start in range(n * block // _BLOCKS, last, _CHUNK):
+            rows = min(_CHUNK, last - start)
             w_at, b_at, y_at = size, columns, total
             o = widths[layers]
             after[: rows * o] = float32(0)
             for r in range(rows):
                 for j in range(d_y.shape[1]):
-                    after[r * o + j] = d_y[chosen[r], j]
+                    after[r * o + j] = d_y[start + r, j]
             for layer in range(layers - 1, -1, -1):
                 k, o = widths[layer], widths[layer + 1]
                 w_at, b_at, y_at = w_at - k * o, b_at - o, y_at - n * o
+                x_at = 0 if layer == 0 else y_at - n * k
                 source = x_flat if layer == 0 else outputs
-                start = 0 if layer == 0 else y_at - n * k
                 pitch = x_row if layer == 0 else k
-                at = start + chosen[0] * pitch
-                if not together:
-                    _copy_rows(source, start, pitch, chosen, rows, picked, k)
-                    source, at, pitch = picked, 0, k
                 _add_rows(after, rows, o, b_flat, block * columns + b_at)
                 _add_product(
-                    source, at, 1, pitch, k, after, 0, o, rows,
+                    source, x_at + start * pitch, 1, pitch, k, after, 0, o, rows,
                     w_flat, block * size + w_at, o, o,
                 )  # fmt: skip
-                if layer > 0 or wanted:
+                if layer > 0:
                     before[: rows * k] = float32(0)
                     _add_product(after, 0, o, 1, rows, turned, w_at, k, o, before, 0, k, k)
-                if layer > 0:
-                    _mask(before, source, at, rows * k)
+                    _mask(before, outputs, x_at + start * k, rows * k)
                     after, before = before, after
                 elif wanted:
-                    _put_rows(before, k, chosen, rows, d_x_flat, x_row, add)
+                    if not add:
+                        d_x_flat[start * x_row : (start + rows) * x_row] = float32(0)
+                    _add_product(
+                        after, 0, o, 1, rows, turned, w_at, k, o, d_x_flat, start * x_row, x_row, k
+                    )
     for block in range(1, _BLOCKS):
         for o in range(0, size, _LANES):
             simd.store(w_flat, o, simd.load(w_flat, o) + simd.load(w_flat, block * size + o))

@@ -9,7 +9,6 @@ linear samples, positions clamped to the border. One call serves all levels.
 
 from __future__ import annotations
 
-import numpy as np
 from numba import float32, prange
 
 from gsdmsr_cli.kernels import simd
@@ -145,7 +144,6 @@ def lookup_backward(
 
     Every thread owns whole chunks of 16 channels, so that threads never write to one place and
     the sums do not depend on their number. Points outside [-1, 1] get no gradient along that axis.
-    Points whose ``d_features`` are 0 cost next to nothing.
 
     Args:
         points, box, time, spaces, lines: see ``lookup``.
@@ -156,14 +154,6 @@ def lookup_backward(
         d_points: (N, 3) out, or (0, 3) if not wanted.
     """
     n, width, d_out = points.shape[0], d_features.shape[1], d_features.reshape(-1)
-    idle = np.empty(n, np.bool_)
-    for i in range(n):
-        idle[i] = True
-        for task in range(shares.shape[0]):
-            d = simd.load(d_out, i * width + task * _LANES)
-            if simd.reduce_max(simd.maximum(d, d * float32(-1))) != float32(0):
-                idle[i] = False
-                break
     for task in prange(shares.shape[0]):
         level, before = 0, 0
         while task >= before + spaces[level].shape[1]:
@@ -180,10 +170,6 @@ def lookup_backward(
             d_space[axis, c] = float32(0)
             d_line[axis, c] = float32(0)
         for i in range(n):
-            if idle[i]:
-                if d_points.shape[0] > 0:
-                    shares[task, i] = float32(0)
-                continue
             px, py, pz = (
                 _in_box(points, box, i, 0),
                 _in_box(points, box, i, 1),
