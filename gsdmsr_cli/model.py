@@ -19,27 +19,23 @@ STORED_AS = "splats."
 MOVED_BY = "motion."
 STORED = tuple(STORED_AS + name for name in NAMES)
 """Names of the splats' own tensors, which have a row for each splat."""
-STILL = "motion.still"
-"""Under which name ``Model.still`` is saved."""
+MOVING = "motion.moving"
+"""Under which name ``Model.moving`` is saved."""
 
 
 class Model:
     """N canonical splats and the motion of those that move; mutable, since training changes both.
 
     Attributes:
-        splats: all of them.
-        motion: holds and moves those that move, in their order.
-        still: (N,) bool, those that stay where they are at all times, and cost no motion.
+        splats: all of them, those that move first: taking them apart then copies nothing.
+        motion: holds and moves those that move.
+        moving: how many do; the others stay where they are at all times, and cost no motion.
     """
 
-    def __init__(self, splats: Splats, motion: Motion, still: Tensor | None = None) -> None:
+    def __init__(self, splats: Splats, motion: Motion, moving: int | None = None) -> None:
         self.splats = splats.map(lambda t: torch.nn.Parameter(t.detach().contiguous()))
         self.motion = motion
-        self._let_rest(torch.zeros(len(splats), dtype=torch.bool) if still is None else still)
-
-    def _let_rest(self, still: Tensor) -> None:
-        self.still = still
-        self._moving = (~still).nonzero().flatten()
+        self.moving = len(splats) if moving is None else moving
 
     def at(self, time: float, teachers: Tensor | None = None) -> Splats:
         """Return the splats at ``time`` in [0, 1].
@@ -49,17 +45,19 @@ class Model:
                 None. The others pass theirs to their canonical values alone, as if what the motion
                 adds to them were constant.
         """
-        if len(self._moving) == len(self.splats):
+        if self.moving == len(self.splats):
             return self._move(self.splats, time, teachers)
-        if not len(self._moving):
+        if not self.moving:
             return self.splats
-        before = self.splats.take(self._moving)
-        own = None if teachers is None else teachers[self._moving]
+        sizes = [self.moving, len(self.splats) - self.moving]
+        parts = {name: tensor.split(sizes) for name, tensor in self.splats.tensors().items()}
+        before = Splats(**{name: first for name, (first, _) in parts.items()})
+        own = None if teachers is None else teachers[: self.moving]
         after = self._move(before, time, own).tensors()
         moved = {
-            name: getattr(self.splats, name).index_copy(0, self._moving, after[name])
-            for name, tensor in before.tensors().items()
-            if after[name] is not tensor  # what the motion leaves alone needs no copy
+            name: torch.cat([after[name], still])
+            for name, (first, still) in parts.items()
+            if after[name] is not first  # what the motion leaves alone needs no copy
         }
         return replace(self.splats, **moved)
 
@@ -69,53 +67,53 @@ class Model:
 
     def penalty(self, time: float, generator: torch.Generator) -> Tensor | None:
         """Return the motion's regularisers, looked at for the splats that move at ``time``."""
-        moving = len(self._moving)
-        splats = self.splats if moving == len(self.splats) else self.splats.take(self._moving)
-        return self.motion.penalty(splats, time, generator) if moving else None
+        splats = self.splats.map(lambda tensor: tensor[: self.moving])
+        return self.motion.penalty(splats, time, generator) if self.moving else None
 
-    def take(self, rows: Tensor) -> Tensor:
+    def take(self, rows: Tensor) -> None:
         """Make row i what row ``rows[i]`` was; rows is (M,) int64.
 
         The one resize verb: clone, split, prune and reorder. For every motion
-        ``take`` then ``at`` equals ``at`` then ``take``.
+        ``take`` then ``at`` equals ``at`` then ``take``. The motion takes the first ``moving``
+        rows, as that is afterwards.
 
-        Returns:
-            the rows that ``motion`` has taken; its own count only the splats that move.
+        Raises:
+            ValueError: the row of a splat that moves comes after one of a splat that does not.
         """
-        places = (~self.still).cumsum(0) - 1
-        still = self.still[rows]
-        held = places[rows[~still]]
-        self._resize(rows, held, still)
-        return held
+        moves = rows < self.moving
+        moving = int(moves.sum())
+        if not moves[:moving].all():
+            raise ValueError("rows of splats that move come after rows of splats that stand still")
+        self._resize(rows, moving)
 
-    def become(self, still: Tensor) -> None:
-        """Take the shapes of a model with such a ``still``; all values must then be set anew."""
-        rows = torch.zeros(len(still), dtype=torch.int64)
-        self._resize(rows, rows[~still], still)
+    def become(self, count: int, moving: int) -> None:
+        """Take the shapes of a model of so many splats; all values must then be set anew."""
+        self._resize(torch.zeros(count, dtype=torch.int64), moving)
 
-    def _resize(self, rows: Tensor, held: Tensor, still: Tensor) -> None:
+    def _resize(self, rows: Tensor, moving: int) -> None:
         self.splats = self.splats.detach().take(rows).map(torch.nn.Parameter)
-        self.motion.take(held)
-        self._let_rest(still)
+        self.motion.take(rows[:moving])
+        self.moving = moving
 
     @torch.no_grad()
     def settle(self, still: Tensor, where: Splats) -> Tensor:
-        """Let further splats stand still.
+        """Let further splats stand still, and put them behind those that move.
 
         Args:
             still: (N,) bool, those that are to stand still; ones that do already may be named.
             where: N splats, whose values those take that begin to.
 
         Returns:
-            the rows that ``motion`` has taken, as ``take`` does.
+            the row (N,) that each row was; the motion has taken the first ``moving`` of them.
         """
-        fresh = still & ~self.still
+        fresh = still[: self.moving]
         for name, tensor in self.splats.tensors().items():
-            tensor[fresh] = getattr(where, name)[fresh]
-        held = (~still[self._moving]).nonzero().flatten()
-        self.motion.take(held)
-        self._let_rest(self.still | still)
-        return held
+            tensor[: self.moving][fresh] = getattr(where, name)[: self.moving][fresh]
+        settled = torch.arange(len(self.splats)) >= self.moving
+        settled[: self.moving] |= fresh
+        order = settled.to(torch.uint8).argsort(stable=True)
+        self._resize(order, len(order) - int(settled.sum()))
+        return order
 
     def tensors(self) -> dict[str, Tensor]:
         """Return everything that is trained and saved, by name."""
@@ -157,7 +155,7 @@ def load_model(
     """Rebuild a model from its saved tensors.
 
     Args:
-        tensors: what ``Model.tensors`` returned, and ``STILL`` if any stand still, perhaps among
+        tensors: what ``Model.tensors`` returned, and ``MOVING`` if not all move, perhaps among
             others.
         settings: the motion's name and options.
         facts: the facts the motion was started with.
@@ -167,16 +165,15 @@ def load_model(
         DataError: a tensor is missing or has another shape than the settings ask for.
     """
     stored = {k: v for k, v in tensors.items() if k.startswith(STORED_AS)}
-    still = tensors.get(STILL)
     try:
         splats = Splats(**{name.removeprefix(STORED_AS): t for name, t in stored.items()})
     except (TypeError, ValueError) as error:
         raise DataError(f"the checkpoint's splats cannot be used: {error}") from error
-    if still is not None and (still.dtype, len(still)) != (torch.bool, len(splats)):
-        raise DataError(f"the checkpoint holds '{STILL}' of {len(still)} rows, not {len(splats)}")
-    moving = len(splats) if still is None else len(splats) - int(still.sum())
+    moving = int(tensors[MOVING]) if MOVING in tensors else len(splats)
+    if not 0 <= moving <= len(splats):
+        raise DataError(f"the checkpoint says that {moving} of {len(splats)} splats move")
     motion = start_motion(settings, facts, moving, torch.Generator())
-    model = Model(splats, motion, still)
+    model = Model(splats, motion, moving)
     model.motion.advance(progress)
     with torch.no_grad():
         for name, tensor in model.motion.tensors().items():

@@ -10,7 +10,7 @@ from torch import Tensor
 from gsdmsr_cli import motion as motions
 from gsdmsr_cli import plugins
 from gsdmsr_cli.errors import DataError
-from gsdmsr_cli.model import STILL, Model, load_model
+from gsdmsr_cli.model import MOVING, Model, load_model
 from gsdmsr_cli.splats import Splats
 
 COUNT = 9
@@ -79,14 +79,17 @@ def test_take_resizes_splats_and_motion_alike(name: str) -> None:
 
 
 STILL_ROWS = torch.tensor([False, True, True, False, False, True, False, False, True])
+ORDER = [0, 3, 4, 6, 7, 1, 2, 5, 8]
+"""The rows of those that move, then of those that do not."""
 
 
 def settled(name: str) -> tuple[Model, Splats]:
-    """Return a model of which some splats stand still, and where those are."""
+    """Return a model of which some splats stand still, and where they all are in the new order."""
     model = model_of(name)
     where = model.at(0.7).map(lambda tensor: tensor.detach().clone())
-    model.settle(STILL_ROWS, where)
-    return model, where
+    order = model.settle(STILL_ROWS, where)
+    assert order.tolist() == ORDER and model.moving == 5
+    return model, where.take(order)
 
 
 @every_motion
@@ -96,19 +99,20 @@ def test_splats_that_stand_still_stay_and_the_others_move_as_before(name: str) -
     for time in (0.0, 0.37, 1.0):
         moved, unsettled = model.at(time).tensors(), before.at(time).tensors()
         for what, tensor in moved.items():
-            assert torch.equal(tensor[STILL_ROWS], where.tensors()[what][STILL_ROWS]), what
-            expected = unsettled[what][~STILL_ROWS]
-            torch.testing.assert_close(tensor[~STILL_ROWS], expected, atol=1e-6, rtol=1e-6)
+            assert torch.equal(tensor[5:], where.tensors()[what][5:]), what
+            torch.testing.assert_close(
+                tensor[:5], unsettled[what][~STILL_ROWS], atol=1e-6, rtol=1e-6
+            )
 
 
 @every_motion
 def test_gradients_of_splats_that_stand_still_reach_no_motion(name: str) -> None:
     model, _ = settled(name)
     moved = model.at(0.3)
-    parts = [t[STILL_ROWS].square().sum() for t in moved.tensors().values()]
+    parts = [t[5:].square().sum() for t in moved.tensors().values()]
     torch.stack(parts).sum().backward()
     for what, tensor in model.splats.tensors().items():
-        assert torch.equal(tensor.grad[STILL_ROWS], 2 * tensor.detach()[STILL_ROWS]), what
+        assert torch.equal(tensor.grad[5:], 2 * tensor.detach()[5:]), what
     for what, tensor in model.motion.tensors().items():
         assert tensor.grad is None or not tensor.grad.any(), what
 
@@ -117,15 +121,21 @@ def test_gradients_of_splats_that_stand_still_reach_no_motion(name: str) -> None
 def test_what_stands_still_follows_a_resize(name: str) -> None:
     """Rows repeat, are absent and change places, of both kinds."""
     model, _ = settled(name)
-    rows = torch.tensor([8, 0, 1, 1, 6, 6, 5])
+    rows = torch.tensor([4, 1, 1, 8, 5, 5])
     expected, names = model.at(0.4).take(rows), model.held_by_motion()
-    held = model.take(rows)
-    assert torch.equal(model.still, STILL_ROWS[rows])
-    assert held.tolist() == [0, 3, 3]  # of the rows 0, 3, 4, 6 and 7, which move
+    model.take(rows)
+    assert model.moving == 3
     for what, tensor in model.at(0.4).tensors().items():
         torch.testing.assert_close(tensor, expected.tensors()[what], atol=1e-6, rtol=1e-6)
     for what in names:
         assert len(model.tensors()[what]) == 3, what
+
+
+def test_splats_that_move_come_first() -> None:
+    model, _ = settled("static")
+    with pytest.raises(ValueError, match="come after"):
+        model.take(torch.tensor([0, 5, 1]))
+    assert len(model.splats) == COUNT
 
 
 @every_motion
@@ -133,11 +143,11 @@ def test_further_splats_can_be_let_stand_still(name: str) -> None:
     model, first = settled(name)
     later = model.at(0.2).map(lambda tensor: tensor.detach().clone())
     further = torch.tensor([True] + 8 * [False])
-    assert model.settle(further, later).tolist() == [1, 2, 3, 4]
-    assert torch.equal(model.still, STILL_ROWS | further)
-    assert torch.equal(model.at(0.9).means[0], later.means[0])
-    model.settle(STILL_ROWS, later)  # those that stand still already stay where they are
-    assert torch.equal(model.at(0.9).means[1], first.means[1])
+    assert model.settle(further, later).tolist() == [1, 2, 3, 4, 0, 5, 6, 7, 8]
+    assert model.moving == 4
+    assert torch.equal(model.at(0.9).means[4], later.means[0])
+    model.settle(torch.arange(COUNT) > 4, later)  # those that stand still already stay there
+    assert torch.equal(model.at(0.9).means[5:], first.means[5:])
 
 
 @every_motion
@@ -151,20 +161,21 @@ def test_all_splats_may_stand_still(name: str) -> None:
 
 
 @every_motion
-def test_who_stands_still_is_saved(name: str) -> None:
+def test_how_many_move_is_saved(name: str) -> None:
     model, _ = settled(name)
-    loaded = load_model({**saved(model), STILL: model.still}, {"name": name}, FACTS, 1.0)
-    assert torch.equal(loaded.still, model.still)
+    tensors = {**saved(model), MOVING: torch.tensor(5)}
+    loaded = load_model(tensors, {"name": name}, FACTS, 1.0)
+    assert loaded.moving == 5
     assert torch.equal(loaded.at(0.6).means, model.at(0.6).means)
-    with pytest.raises(DataError, match=r"'motion\.still' of 3 rows, not 9"):
-        load_model({**saved(model), STILL: model.still[:3]}, {"name": name}, FACTS, 1.0)
+    with pytest.raises(DataError, match="10 of 9 splats move"):
+        load_model({**tensors, MOVING: torch.tensor(10)}, {"name": name}, FACTS, 1.0)
 
 
 @every_motion
 def test_a_model_takes_the_shapes_of_another(name: str) -> None:
     model, other = settled(name)[0], model_of(name)
     model.take(torch.tensor([1, 0, 3, 5]))
-    other.become(model.still)
+    other.become(4, 3)
     shapes = {what: tensor.shape for what, tensor in model.tensors().items()}
     assert {what: tensor.shape for what, tensor in other.tensors().items()} == shapes
     assert len(other.at(0.5)) == 4

@@ -56,7 +56,7 @@ def run(
             rows.append(
                 {
                     "below": threshold,
-                    "still": float(model.still.double().mean()),
+                    "still": 1 - model.moving / len(model.splats),
                     "psnr": protocol.average([scores for _, scores in scored])["psnr"],
                     "fps": speeds[threshold],
                     "ratio": speeds[threshold] / speeds[0.0],

@@ -145,16 +145,16 @@ class _Watch:
 
     def report(self) -> Report:
         """Return the report and begin anew."""
-        clock = self.trainer.clock
+        clock, model = self.trainer.clock, self.trainer.model
         finite = [loss for loss in self.losses if math.isfinite(loss)]
         report = Report(
             step=clock.step,
             elapsed=clock.elapsed,
             progress=clock.progress,
             loss=sum(finite) / len(finite) if finite else None,
-            splats=len(self.trainer.model.splats),
+            splats=len(model.splats),
             salient=_share(self.trainer.saliency.high),
-            still=_share(self.trainer.model.still),
+            still=1 - model.moving / len(model.splats),
             ms_per_step=1000 * (clock.elapsed - self.elapsed) / len(self.losses),
             psnr=self._psnr(),
             split=self.view.split,

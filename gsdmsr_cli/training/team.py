@@ -43,13 +43,13 @@ class _Task:
     """What a helper is to look at.
 
     Attributes:
-        still: (N,) which of the splats stand still, if that or their number is new, else None.
+        sizes: how many splats there are and how many move, if that is new, else None.
         teachers, progress, moving: see ``Stage``.
         views: rows of the team's views.
         tile_weights: of each view, see ``Observer.look``.
     """
 
-    still: NDArray[np.bool_] | None
+    sizes: tuple[int, int] | None
     teachers: NDArray[np.bool_] | None
     progress: float
     moving: bool
@@ -174,7 +174,7 @@ class _Helper:
     ) -> None:
         self.answers = desk.answers
         self.ready = False
-        self._told: Tensor | None = None
+        self._told = (0, 0)
         self.pipe, theirs = multiprocessing.Pipe()
         # a copy of this end in any helper would keep that helper from noticing the training's end
         given = theirs, [*earlier, self.pipe], desk, prepare
@@ -190,11 +190,12 @@ class _Helper:
 
     def send(self, model: Model, views: Sequence[tuple[int, Tensor | None]], stage: Stage) -> None:
         self.wait()
-        still = None if model.still is self._told else model.still
-        self._told = model.still  # a model never changes it in place
+        sizes = len(model.splats), model.moving
+        news = None if sizes == self._told else sizes
+        self._told = sizes
         rows, weights = zip(*views, strict=True)
         task = _Task(
-            _sent(still), _sent(stage.teachers), stage.progress, stage.moving, rows,
+            news, _sent(stage.teachers), stage.progress, stage.moving, rows,
             [_sent(own) for own in weights],
         )  # fmt: skip
         try:
@@ -263,8 +264,8 @@ class _Desk:
     def do(self, task: _Task) -> list[_Answer]:
         """Look at the task's views."""
         model = self._model
-        if task.still is not None:
-            model.become(torch.from_numpy(task.still))
+        if task.sizes is not None:
+            model.become(*task.sizes)
             self.published.lend(model)
         model.motion.advance(task.progress)
         stage = Stage(task.progress, task.moving, _received(task.teachers))

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from gsdmsr_cli.errors import GsdmsrError
-from gsdmsr_cli.model import MOVED_BY, STILL, STORED, STORED_AS, Model, load_model
+from gsdmsr_cli.model import MOVED_BY, MOVING, STORED, STORED_AS, Model, load_model
 from gsdmsr_cli.motion import start_motion
 from gsdmsr_cli.pictures import Pictures
 from gsdmsr_cli.preset import Preset
@@ -151,7 +151,7 @@ class Trainer:
         """Return the model that the training has led to: the average where there is one yet."""
         if not self.average.count:
             return self.model
-        tensors = self.average.tensors | {STILL: self.model.still}
+        tensors = self.average.tensors | {MOVING: torch.tensor(self.model.moving)}
         return load_model(tensors, self.preset.motion, self.facts, self.clock.progress)
 
     def _penalise(
@@ -215,7 +215,7 @@ class Trainer:
         """Return what the rows of all tensors with a row per splat may do in this step."""
         multipliers = self.saliency.multipliers(self.clock.step)
         by_name = dict.fromkeys(STORED, multipliers)
-        by_name |= dict.fromkeys(self.model.held_by_motion(), multipliers[~self.model.still])
+        by_name |= dict.fromkeys(self.model.held_by_motion(), multipliers[: self.model.moving])
         return {name: Gate(m, torch.zeros_like(tensors[name])) for name, m in by_name.items()}
 
     def _attend(self, looks: Sequence[Look], gates: Mapping[str, Gate]) -> None:
@@ -227,7 +227,7 @@ class Trainer:
         woken = self.saliency.observe(now, seen)
         if woken.any():  # what they were about to do when they fell asleep is of no use any more
             self.optimizer.calm(STORED, woken)
-            self.optimizer.calm(self.model.held_by_motion(), woken[~self.model.still])
+            self.optimizer.calm(self.model.held_by_motion(), woken[: self.model.moving])
 
     def _control_density(self, progress: float) -> None:
         options = self.preset.density
@@ -241,16 +241,13 @@ class Trainer:
                     f"no splats are left at step {self.clock.step}; lower density.prune_opacity or "
                     "check that cameras and pictures belong together"
                 )
-            held = self.model.take(rows)
+            self.model.take(rows)
             with torch.no_grad():
                 for name, tensor in self.model.splats.tensors().items():
                     tensor.copy_(getattr(grown, name))
-            self._follow(STORED, rows, fresh)
-            self._follow(self.model.held_by_motion(), held, fresh[~self.model.still])
+            self._follow(rows, fresh)
             if fresh.any():
                 self.average.forget()
-            self.statistics = DensityStatistics(len(rows))
-            self.saliency.take(rows, fresh)
         if self._resets < len(options.reset_at) and progress >= options.reset_at[self._resets]:
             self._resets += 1
             reset_opacities(self.model.splats)
@@ -270,10 +267,15 @@ class Trainer:
         self._rounds += 1
         return True
 
-    def _follow(self, names: Sequence[str], rows: Tensor, fresh: Tensor) -> None:
-        """Resize what is kept beside the named tensors of the model."""
-        self.optimizer.take(names, rows, fresh)
-        self.average.take(names, rows)
+    def _follow(self, rows: Tensor, fresh: Tensor) -> None:
+        """Resize what is kept beside the model, which has taken these rows."""
+        held = slice(self.model.moving)
+        self.optimizer.take(STORED, rows, fresh)
+        self.optimizer.take(self.model.held_by_motion(), rows[held], fresh[held])
+        self.average.take(STORED, rows)
+        self.average.take(self.model.held_by_motion(), rows[held])
+        self.statistics = DensityStatistics(len(rows))
+        self.saliency.take(rows, fresh)
 
     def _settle(self, progress: float) -> None:
         """Let splats stand still that hardly move; not while splats are grown or averaged."""
@@ -283,9 +285,8 @@ class Trainer:
             return
         if self.clock.step % options.still_every == 0:
             saliency, mean = motion_saliency(self.model)
-            held = self.model.settle(saliency < options.still_below, mean)
-            none = torch.zeros(len(held), dtype=torch.bool)
-            self._follow(self.model.held_by_motion(), held, none)
+            order = self.model.settle(saliency < options.still_below, mean)
+            self._follow(order, torch.zeros(len(order), dtype=torch.bool))
 
     def _skip(self) -> Step:
         """Drop a step whose loss is not finite; give up after many in a row."""
@@ -305,8 +306,8 @@ class Trainer:
         if self.average.count:
             tensors = {_LAST + name: tensor for name, tensor in tensors.items()}
             tensors |= self.average.tensors
-        if self.model.still.any():
-            tensors[STILL] = self.model.still
+        if self.model.moving < len(self.model.splats):
+            tensors[MOVING] = torch.tensor(self.model.moving)
         tensors |= {_FIRST + name: t for name, t in self.optimizer.first.items()}
         tensors |= {_SECOND + name: t for name, t in self.optimizer.second.items()}
         tensors[_SEEN + "total"] = self.statistics.total
@@ -334,8 +335,8 @@ class Trainer:
         if self.average.count:
             last = _below(_LAST, tensors)
             self.average.tensors = {name: tensors[name] for name in last}
-            if STILL in tensors:
-                last[STILL] = tensors[STILL]
+            if MOVING in tensors:
+                last[MOVING] = tensors[MOVING]
         self.model = load_model(last, self.preset.motion, self.facts, checkpoint.progress)
         self.optimizer.first.update(_below(_FIRST, tensors))
         self.optimizer.second.update(_below(_SECOND, tensors))

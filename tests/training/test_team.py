@@ -68,7 +68,7 @@ def test_helpers_know_who_stands_still(tiny_scene: Path) -> None:
     losses = [alone.step().loss for _ in range(STEPS)]
     with hired(tiny_scene, *options) as helped:
         assert [helped.step().loss for _ in range(STEPS)] == losses
-    assert 0 < int(helped.model.still.sum()) < len(helped.model.splats)
+    assert 0 < helped.model.moving < len(helped.model.splats)
     assert_same_tensors(copies(helped.checkpoint().tensors), copies(alone.checkpoint().tensors))
 
 

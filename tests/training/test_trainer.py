@@ -234,23 +234,24 @@ def test_splats_that_hardly_move_are_let_stand_still(tiny_scene: Path) -> None:
     shares = []
     for _ in range(STEPS):
         trainer.step()
-        shares.append(float(trainer.model.still.float().mean()))
+        shares.append(1 - trainer.model.moving / len(trainer.model.splats))
     assert shares[: STEPS // 2] == [0.0] * (STEPS // 2)
     assert 0 < shares[-1] < 1 and shares == sorted(shares)
     # after step 35, which begins at 0.85, averaging is near and nothing changes any more
     assert shares[35:] == [shares[35]] * 5
-    moving = int((~trainer.model.still).sum())
+    moving = trainer.model.moving
     assert len(trainer.optimizer.first["motion.embeddings"]) == moving
     assert len(trainer.optimizer.first["splats.means"]) == len(trainer.model.splats)
     first, last = trainer.model.at(0.0).means, trainer.model.at(1.0).means
-    assert torch.equal((first == last).all(dim=1), trainer.model.still)
+    still = torch.arange(len(first)) >= moving
+    assert torch.equal((first == last).all(dim=1), still)
 
 
 def test_nothing_stands_still_unless_asked_for(tiny_scene: Path) -> None:
     trainer = trainer_of(tiny_scene, preset_of())
     after(trainer, STEPS)
-    assert not trainer.model.still.any()
-    assert not any("still" in name for name in trainer.checkpoint().tensors)
+    assert trainer.model.moving == len(trainer.model.splats)
+    assert not any("moving" in name for name in trainer.checkpoint().tensors)
 
 
 def test_a_training_with_still_splats_is_resumed_as_if_never_interrupted(
@@ -264,11 +265,11 @@ def test_a_training_with_still_splats_is_resumed_as_if_never_interrupted(
         run = run_of(first, tmp_path / str(stop))
         run.save(first.checkpoint())
         second.restore(run.load())
-        assert 0 < int(second.model.still.sum()) < len(second.model.splats)
+        assert 0 < second.model.moving < len(second.model.splats)
         assert after(second, STEPS - stop) == losses[stop:]
         assert_same_tensors(state_of(second), state_of(whole))
         model, _ = run.load_model()
-        assert torch.equal(model.still, first.model.still)
+        assert model.moving == first.model.moving
         assert torch.equal(model.at(0.3).means, first.result().at(0.3).means)
 
 
