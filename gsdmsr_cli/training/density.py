@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 
 import torch
 from torch import Tensor
@@ -50,6 +51,14 @@ class DensityStatistics:
     def mean(self) -> Tensor:
         """Return the (N,) means; 0 where a splat was never drawn."""
         return self.total / self.views.clamp(min=1)
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Return the state by name."""
+        return {"total": self.total, "views": self.views}
+
+    def restore(self, tensors: Mapping[str, Tensor]) -> None:
+        """Return to what ``tensors`` returned."""
+        self.total, self.views = tensors["total"], tensors["views"]
 
 
 @torch.no_grad()

@@ -12,13 +12,12 @@ from dataclasses import dataclass, field
 from types import FrameType
 from typing import Any
 
-import torch
 from torch import Tensor
 
 from gsdmsr_cli.evaluation.metrics import PSNR_CAP, psnr, quantize
+from gsdmsr_cli.evaluation.protocol import Studio
 from gsdmsr_cli.run import Run
 from gsdmsr_cli.scene import Scene, View
-from gsdmsr_cli.splatting import draw
 from gsdmsr_cli.training.trainer import Trainer
 
 TELL_EVERY = 2.0
@@ -162,13 +161,11 @@ class _Watch:
         self.begin()
         return report
 
-    @torch.no_grad()
     def _psnr(self) -> float | None:
-        observer, view = self.trainer.observer, self.view
-        camera, target = observer.pictures.camera(view), observer.pictures.load(view)
-        model = self.trainer.result()
-        frame = draw(model, camera, view.time, observer.engine, observer.background)
-        value = psnr(quantize(frame.rgb), target.permute(1, 2, 0) / 255)
+        observer = self.trainer.observer
+        model, background = self.trainer.result(), observer.background
+        studio = Studio(model, observer.engine, observer.pictures, background)
+        value = psnr(quantize(studio.draw(self.view)), studio.true(self.view))
         return None if math.isnan(value) else min(value, PSNR_CAP)
 
 

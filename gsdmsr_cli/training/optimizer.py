@@ -11,8 +11,11 @@ from torch import Tensor
 
 from gsdmsr_cli.kernels import adam as kernels
 from gsdmsr_cli.tensors import has_kernels
+from gsdmsr_cli.training.state import below
 
 BETA1, BETA2, EPS = 0.9, 0.999, 1e-15
+
+_FIRST, _SECOND = "first.", "second."
 
 
 class Gate(NamedTuple):
@@ -116,6 +119,15 @@ class Adam:
         for moments in (self.first, self.second) if second else (self.first,):
             if name in moments:
                 moments[name].zero_()
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Return the moments by name; the step counts are numbers, to be kept elsewhere."""
+        first = {_FIRST + name: tensor for name, tensor in self.first.items()}
+        return first | {_SECOND + name: tensor for name, tensor in self.second.items()}
+
+    def restore(self, tensors: Mapping[str, Tensor]) -> None:
+        """Return to what ``tensors`` returned."""
+        self.first, self.second = below(_FIRST, tensors), below(_SECOND, tensors)
 
 
 def adam_steps(moves: Sequence[Move]) -> None:

@@ -26,6 +26,7 @@ from gsdmsr_cli.training.look import Look, Observer, Stage
 from gsdmsr_cli.training.optimizer import Adam, Gate
 from gsdmsr_cli.training.saliency import Saliency, step_saliency
 from gsdmsr_cli.training.schedule import log_linear, new_clock
+from gsdmsr_cli.training.state import Part, below, gather, scatter
 from gsdmsr_cli.training.stillness import motion_saliency
 from gsdmsr_cli.training.team import Team
 from gsdmsr_cli.training.tiles import TileSampler
@@ -39,8 +40,7 @@ PRUNE_EVERY = 500
 PATIENCE = 20
 """Consecutive steps without a finite loss after which training gives up."""
 
-_FIRST, _SECOND, _SEEN, _LAST = "adam.first.", "adam.second.", "density.", "last."
-_SALIENCY, _TILES = "saliency.", "tiles."
+_LAST = "last."
 
 
 @dataclass(frozen=True)
@@ -300,6 +300,15 @@ class Trainer:
             )
         return Step(math.nan)
 
+    def _parts(self) -> dict[str, Part]:
+        """Return what is kept beside the model, by the prefix of its tensors in a checkpoint."""
+        return {
+            "adam.": self.optimizer,
+            "density.": self.statistics,
+            "saliency.": self.saliency,
+            "tiles.": self.tiles,
+        }
+
     def checkpoint(self) -> Checkpoint:
         """Return the result so far and everything needed to go on from here."""
         tensors = dict(self.model.tensors())
@@ -308,12 +317,7 @@ class Trainer:
             tensors |= self.average.tensors
         if self.model.moving < len(self.model.splats):
             tensors[MOVING] = torch.tensor(self.model.moving)
-        tensors |= {_FIRST + name: t for name, t in self.optimizer.first.items()}
-        tensors |= {_SECOND + name: t for name, t in self.optimizer.second.items()}
-        tensors[_SEEN + "total"] = self.statistics.total
-        tensors[_SEEN + "views"] = self.statistics.views
-        tensors |= {_SALIENCY + name: t for name, t in self.saliency.tensors().items()}
-        tensors |= {_TILES + name: t for name, t in self.tiles.tensors().items()}
+        tensors |= gather(self._parts())
         tensors["generator"] = self.generator.get_state()
         state = {
             "queue": self._queue,
@@ -333,31 +337,19 @@ class Trainer:
         self.average.count = int(state["averaged"])
         last = dict(tensors)
         if self.average.count:
-            last = _below(_LAST, tensors)
+            last = below(_LAST, tensors)
             self.average.tensors = {name: tensors[name] for name in last}
             if MOVING in tensors:
                 last[MOVING] = tensors[MOVING]
         self.model = load_model(last, self.preset.motion, self.facts, checkpoint.progress)
-        self.optimizer.first.update(_below(_FIRST, tensors))
-        self.optimizer.second.update(_below(_SECOND, tensors))
-        self.optimizer.steps = {name: int(count) for name, count in state["adam_steps"].items()}
         self.statistics = DensityStatistics(len(self.model.splats))
-        self.statistics.total, self.statistics.views = (
-            tensors[_SEEN + "total"],
-            tensors[_SEEN + "views"],
-        )
-        self.saliency.restore(_below(_SALIENCY, tensors))
-        self.tiles.restore(_below(_TILES, tensors))
+        scatter(self._parts(), tensors)
+        self.optimizer.steps = {name: int(count) for name, count in state["adam_steps"].items()}
         self.generator.set_state(tensors["generator"])
         self._queue = list(state["queue"])
         self._rounds, self._resets = int(state["rounds"]), int(state["resets"])
         self._moving = bool(state["moving"])
         self.clock.step, self.clock.before = checkpoint.step, checkpoint.elapsed
-
-
-def _below(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Return the tensors whose names begin with the prefix, without it."""
-    return {n.removeprefix(prefix): t for n, t in tensors.items() if n.startswith(prefix)}
 
 
 def _sum(parts: Sequence[Tensor | None]) -> Tensor | None:

@@ -1,0 +1,34 @@
+"""The state of a training as named tensors: those of each of its parts, under a prefix."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Protocol
+
+from torch import Tensor
+
+
+class Part(Protocol):
+    """Something that a training keeps beside its model."""
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Return the state by name."""
+
+    def restore(self, tensors: Mapping[str, Tensor]) -> None:
+        """Return to what ``tensors`` returned."""
+
+
+def gather(parts: Mapping[str, Part]) -> dict[str, Tensor]:
+    """Return the tensors of all parts; the keys are their prefixes."""
+    return {p + name: t for p, part in parts.items() for name, t in part.tensors().items()}
+
+
+def scatter(parts: Mapping[str, Part], tensors: Mapping[str, Tensor]) -> None:
+    """Restore all parts from what ``gather`` returned, perhaps among others."""
+    for prefix, part in parts.items():
+        part.restore(below(prefix, tensors))
+
+
+def below(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Return the tensors whose names begin with the prefix, without it."""
+    return {n.removeprefix(prefix): t for n, t in tensors.items() if n.startswith(prefix)}
