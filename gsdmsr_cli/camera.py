@@ -61,6 +61,25 @@ class Camera:
             height=height,
         )
 
+    def framed(self, width: int, height: int) -> Camera:
+        """Return the camera with pictures of ``width`` x ``height`` pixels that crop nothing.
+
+        The same picture resampled where the proportions are the same but for rounding; else one
+        that shows more at two sides, round the same middle.
+        """
+        scale = min(width / self.width, height / self.height)
+        if abs(self.width * scale - width) < 1 and abs(self.height * scale - height) < 1:
+            return self.resized(width, height)
+        return replace(
+            self,
+            fx=self.fx * scale,
+            fy=self.fy * scale,
+            cx=width / 2 + (self.cx - self.width / 2) * scale,
+            cy=height / 2 + (self.cy - self.height / 2) * scale,
+            width=width,
+            height=height,
+        )
+
 
 def look_at(
     centre: NDArray[np.float64], target: NDArray[np.float64], up: NDArray[np.float64]

@@ -1,128 +1,105 @@
-"""gsdmsr render: draws a run to pictures and a video."""
+"""gsdmsr render: draws a run to pictures, numbers and videos."""
 
 from __future__ import annotations
 
-import re
-from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-import torch
-from numpy.typing import NDArray
 from rich.console import Console
 
-from gsdmsr_cli.camera import Camera
-from gsdmsr_cli.commands._progress import Tell, progress_bar
+from gsdmsr_cli.commands._progress import progress_bar
 from gsdmsr_cli.commands._trained import Trained, open_trained
-from gsdmsr_cli.errors import DataError, UsageError
-from gsdmsr_cli.evaluation.metrics import quantize
-from gsdmsr_cli.imaging import write_png, write_webm
-from gsdmsr_cli.paths import orbit
-from gsdmsr_cli.splatting import draw
+from gsdmsr_cli.film import Film, PathOptions
+from gsdmsr_cli.filming.mp4 import require_ffmpeg
+from gsdmsr_cli.filming.outputs import Ends, find_ends
+from gsdmsr_cli.filming.record import Reel, file_hash, shots_hash
+from gsdmsr_cli.filming.request import Request
+from gsdmsr_cli.filming.shoot import Account, shoot
+from gsdmsr_cli.filming.sizes import sized
+from gsdmsr_cli.paths import make_film
 
-ORBIT_FRAMES = 120
-ORBIT_FPS, TEST_FPS = 30.0, 10.0
-
-
-@dataclass(frozen=True, eq=False)
-class Film:
-    """What one path shows.
-
-    Attributes:
-        name: of the path; the pictures go to a folder and the video to a file of that name.
-        shots: camera and time of every frame.
-        fps: frames a second of the video.
-    """
-
-    name: str
-    shots: list[tuple[Camera, float]]
-    fps: float
+USUAL = ("test", "orbit")
+"""Paths that are drawn if none is named."""
 
 
-def run(
-    run_folder: Path,
-    path: str | None,
-    frames: int | None,
-    out: Path | None,
-    data: Path | None = None,
-) -> None:
+def run(run_folder: Path, request: Request, out: Path | None, data: Path | None = None) -> None:
     """Write ``PATH/0000.png`` and so on, and ``PATH.webm``, to ``out`` or else ``RUN/render``.
 
     Args:
         run_folder: the run.
-        path: "test" for the test views in the order of time, "orbit" for a circle round the scene
-            while time goes from 0 to 1, or None for both.
-        frames: number of frames of the orbit.
+        request: what is asked for.
         out: folder to write.
         data: where the data lies now, if not where it lay in training.
 
     Raises:
-        UsageError: a number of frames for the test views.
+        UsageError: a path, view or output that does not exist, or does not go with another wish.
         DataError: the run or its data cannot be used, or a file not be written.
     """
-    if path == "test" and frames is not None:
-        raise UsageError("--frames is for --path orbit; the test views are as many as there are")
+    if "mp4" in request.videos:
+        require_ffmpeg()
     trained = open_trained(run_folder, data)
-    films = []
-    if path in (None, "test"):
-        films.append(_test(trained))
-    if path in (None, "orbit"):
-        films.append(_orbit(trained, frames or ORBIT_FRAMES))
-    target = out or run_folder / "render"
+    films = [_film(trained, path, request) for path in ([request.path] if request.path else USUAL)]
+    target, tools = out or run_folder / "render", _tools(trained, request)
+    prepared = []
     for film in films:
-        _make_room(target / film.name, len(film.shots), ours=out is None)
-    for film in films:
+        ends = find_ends(trained.studio, film.shots, request.outputs)
+        reels = [_reel(film, output, target, tools, ends) for output in request.outputs]
+        for reel in reels:
+            reel.prepare(ours=out is None, anew=request.overwrite)
+        prepared.append((film, reels, ends))
+    for film, reels, ends in prepared:
         with progress_bar(f"drawing {film.name}") as tell:
-            pictures = _draw(trained, film, target / film.name, tell)
-            write_webm(target / f"{film.name}.webm", pictures, film.fps)
-        text = f"wrote {target / film.name}.webm and {len(film.shots)} pictures beside it"
-        Console().out(text, highlight=False)
+            account = shoot(
+                trained.studio, film, reels, ends, request.videos, request.supersample, tell
+            )
+        _report(film, reels, request, account)
 
 
-def _test(trained: Trained) -> Film:
-    views = sorted(trained.scene.split("test"), key=lambda view: view.time)
-    pictures = trained.studio.pictures
-    return Film("test", [(pictures.camera(view), view.time) for view in views], TEST_FPS)
+def _film(trained: Trained, path: str, request: Request) -> Film:
+    """Return the film of a path in the size that is asked for."""
+    # without a path, the number of frames is for the orbit
+    frames = None if request.path is None and path == "test" else request.frames
+    options = PathOptions(frames, request.views)
+    film = make_film(trained.scene, path, options, request.time, request.fps)
+    return sized(film, trained.run.preset.data.downscale, request)
 
 
-def _orbit(trained: Trained, count: int) -> Film:
-    # formats place what is to be reconstructed round the world's origin, see Scene.bound
-    cameras = [trained.studio.pictures.camera(view) for view in trained.scene.split("train")]
-    moments = [i / max(count - 1, 1) for i in range(count)]
-    around = orbit(cameras, np.zeros(3), count)
-    return Film("orbit", list(zip(around, moments, strict=True)), ORBIT_FPS)
+def _tools(trained: Trained, request: Request) -> dict[str, object]:
+    """Return what frames depend on besides their film, for the note beside them."""
+    return {
+        "run": trained.run.name,
+        "checkpoint_sha256": file_hash(trained.run.checkpoint_path),
+        "background": trained.studio.background.tolist(),
+        "supersample": request.supersample,
+    }
 
 
-def _make_room(folder: Path, count: int, ours: bool) -> None:
-    """Make the folder, without pictures of an earlier and longer film.
-
-    Raises:
-        DataError: there are such pictures in a folder that is not ``ours`` to clear, or the folder
-            cannot be made.
-    """
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        numbered = [path for path in folder.iterdir() if re.fullmatch(r"\d{4,}\.png", path.name)]
-    except OSError as error:
-        raise DataError(f"{folder}: cannot be written: {error.strerror or error}") from error
-    left = sorted(path for path in numbered if int(path.stem) >= count)
-    if left and not ours:
-        raise DataError(
-            f"{folder}: holds {len(left)} pictures of a longer film, {left[0].name} the first; "
-            "empty it or choose another --out"
-        )
-    for path in left:
-        path.unlink()
+def _reel(film: Film, output: str, target: Path, tools: dict[str, object], ends: Ends) -> Reel:
+    first = film.shots[0].camera
+    size = first.width, first.height
+    count = len(film.shots) - (output == "flow")
+    asked = {"path": film.name, "frames": count, "size": list(size)}
+    shown = {"shots_sha256": shots_hash(film.shots), **ends.document(output)}
+    name = film.name if output == "rgb" else f"{film.name}-{output}"
+    return Reel(output, target, name, count, size, {**tools, **asked, **shown}, film.fps)
 
 
-@torch.no_grad()
-def _draw(trained: Trained, film: Film, folder: Path, tell: Tell) -> Iterator[NDArray[np.uint8]]:
-    """Draw, write and yield every frame."""
-    studio = trained.studio
-    for index, (camera, moment) in enumerate(film.shots):
-        frame = draw(studio.model, camera, moment, studio.engine, studio.background)
-        pixels = (quantize(frame.rgb) * 255).round().to(torch.uint8).numpy(force=True)
-        write_png(folder / f"{index:04d}.png", pixels)
-        tell(index + 1, len(film.shots))
-        yield pixels
+def _report(film: Film, reels: list[Reel], request: Request, account: Account) -> None:
+    console = Console()
+    for reel in reels:
+        videos = " and ".join(str(reel.video(kind)) for kind in request.videos)
+        beside = f"{videos} and {reel.count} pictures beside it"
+        text = beside if videos else f"{reel.count} pictures to {reel.folder}"
+        console.out(f"wrote {text}", highlight=False)
+    console.out(_spent(film, account), highlight=False)
+
+
+def _spent(film: Film, account: Account) -> str:
+    camera = film.shots[0].camera
+    kept = f", {account.kept} were there already" if account.kept else ""
+    if not account.drawn:
+        return f"nothing to draw{kept}; --overwrite draws them again"
+    share = 100 * account.drawing / account.elapsed
+    return (
+        f"drew {account.drawn} frames of {camera.width} x {camera.height} px{kept}: "
+        f"{account.elapsed:.1f} s, {share:.0f} % of it drawing"
+    )

@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 
 from gsdmsr_cli.camera import Camera, look_at
 from gsdmsr_cli.geometry import quat_to_rotmat
-from gsdmsr_cli.paths import STEEPEST, common_up, orbit
+from gsdmsr_cli.paths._around import STEEPEST, common_up
+from gsdmsr_cli.paths.orbit import orbit
 
 Z = np.array([0.0, 0.0, 1.0])
 ORIGIN = np.zeros(3)

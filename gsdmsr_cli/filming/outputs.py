@@ -1,0 +1,128 @@
+"""Layers to a picture for the eye and, where that is not enough, to numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gsdmsr_cli.evaluation.protocol import Studio
+from gsdmsr_cli.film import Shot
+from gsdmsr_cli.filming.layers import Artist, Floats, Layers
+from gsdmsr_cli.imaging import colour_wheel, turbo
+
+Pixels = NDArray[np.uint8]
+
+CHANNELS = {"depth": ("Z",), "flow": ("u", "v")}
+"""Outputs that are also written as float32 EXR, with the names of its channels."""
+
+FULL_ERROR = 0.25
+"""Mean absolute difference of the colours at which the error's colours end."""
+
+SAMPLES, SAMPLE_SIDE = 8, 128
+"""How many frames, and how large [px], are looked at for the ends of the colours."""
+
+
+@dataclass(frozen=True)
+class Ends:
+    """What the colours of a whole film end at, so that it does not flicker.
+
+    Attributes:
+        near, far: depths [world units].
+        fast: length of the flow, over the picture's larger side.
+    """
+
+    near: float = 0.0
+    far: float = 1.0
+    fast: float = 1.0
+
+    def document(self, output: str) -> dict[str, Any]:
+        """Return the numbers that concern an output, to be written beside it."""
+        concern = {"depth": ("near", "far"), "flow": ("fast",)}.get(output, ())
+        return {key: value for key, value in asdict(self).items() if key in concern}
+
+
+def picture(output: str, layers: Layers, ends: Ends, true: Floats | None) -> Pixels:
+    """Return the (H, W, 1 | 3) picture of an output.
+
+    Args:
+        output: its name.
+        layers: what has been drawn.
+        ends: of the colours.
+        true: (H, W, 3) the true picture in [0, 1]; only the error needs it.
+    """
+    if output == "rgb":
+        return _rounded(layers.rgb)
+    if output == "alpha":
+        return _rounded(layers.alpha)[..., None]
+    if output == "depth":
+        return _depth(layers, ends)
+    if output == "flow":
+        assert layers.flow is not None
+        return colour_wheel(layers.flow / np.float32(ends.fast * max(layers.alpha.shape)))
+    assert output == "error" and true is not None
+    drawn = _rounded(layers.rgb).astype(np.float32) / 255
+    return turbo(np.abs(drawn - true).mean(2) / FULL_ERROR)
+
+
+def numbers(output: str, layers: Layers) -> Floats:
+    """Return the (H, W, C) numbers of an output in ``CHANNELS``."""
+    if output == "depth":
+        return layers.expected_depth[..., None]
+    assert output == "flow" and layers.flow is not None
+    return layers.flow
+
+
+def find_ends(studio: Studio, shots: Sequence[Shot], outputs: Sequence[str]) -> Ends:
+    """Draw some frames of a film small, and return where the colours of all of them are to end.
+
+    Depths end where 1 % of what is seen lies nearer or farther, the flow where 1 % is faster.
+    """
+    wanted = set(CHANNELS) & set(outputs)
+    chosen = range(0, len(shots), -(-len(shots) // SAMPLES))
+    if not wanted:
+        return Ends()
+    artist, depths, speeds = Artist(studio, 1, wanted), [], []
+    for i in chosen:
+        following = _small(shots[i + 1]) if i + 1 < len(shots) else None
+        layers = artist.draw(_small(shots[i]), following)
+        solid = layers.alpha > 0.5
+        if layers.depth is not None:
+            depths.append(layers.expected_depth[solid])
+        if layers.flow is not None:
+            speeds.append(np.linalg.norm(layers.flow[solid], axis=1) / max(layers.alpha.shape))
+    near, far = _percentiles(depths, (1, 99), (0.0, 1.0))
+    (fast,) = _percentiles(speeds, (99,), (1.0,))
+    return Ends(near, max(far, near + 1e-3), max(fast, 1e-6))
+
+
+def _small(shot: Shot) -> Shot:
+    camera = shot.camera
+    scale = min(1.0, SAMPLE_SIDE / max(camera.width, camera.height))
+    size = max(1, round(camera.width * scale)), max(1, round(camera.height * scale))
+    return replace(shot, camera=camera.resized(*size))
+
+
+def _percentiles(
+    parts: list[Floats], percents: tuple[int, ...], otherwise: tuple[float, ...]
+) -> tuple[float, ...]:
+    values = np.concatenate(parts) if parts else np.zeros(0)
+    if not len(values):
+        return otherwise
+    return tuple(float(value) for value in np.percentile(values, percents))
+
+
+def _rounded(layer: Floats) -> Pixels:
+    # NaN becomes 0, as in a cast without the warning
+    return np.asarray(np.rint(np.nan_to_num(layer).clip(0, 1) * 255), dtype=np.uint8)
+
+
+def _depth(layers: Layers, ends: Ends) -> Pixels:
+    """Near is warm, far is cold, what is not seen is black."""
+    depth = np.minimum(layers.expected_depth, np.float32(ends.far))  # which may be infinite
+    nearness = (np.float32(ends.far) - depth) / np.float32(ends.far - ends.near)
+    shade = layers.alpha.clip(0, 1)[..., None]
+    return np.asarray(np.rint(turbo(nearness) * shade), dtype=np.uint8)
