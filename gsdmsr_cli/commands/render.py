@@ -66,7 +66,7 @@ def _film(trained: Trained, path: str, request: Request) -> Film:
 def _tools(trained: Trained, request: Request) -> dict[str, object]:
     """Return what frames depend on besides their film, for the note beside them."""
     return {
-        "run": trained.run.name,
+        "run": str(trained.run.root),
         "checkpoint_sha256": file_hash(trained.run.checkpoint_path),
         "background": trained.studio.background.tolist(),
         "supersample": request.supersample,

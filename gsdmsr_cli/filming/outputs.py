@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from gsdmsr_cli.evaluation.protocol import Studio
 from gsdmsr_cli.film import Shot
 from gsdmsr_cli.filming.layers import Artist, Floats, Layers
-from gsdmsr_cli.imaging import colour_wheel, turbo
+from gsdmsr_cli.imaging import colour_wheel, eight_bits, turbo
 
 Pixels = NDArray[np.uint8]
 
@@ -55,16 +55,17 @@ def picture(output: str, layers: Layers, ends: Ends, true: Floats | None) -> Pix
         true: (H, W, 3) the true picture in [0, 1]; only the error needs it.
     """
     if output == "rgb":
-        return _rounded(layers.rgb)
+        return eight_bits(layers.rgb)
     if output == "alpha":
-        return _rounded(layers.alpha)[..., None]
+        return eight_bits(layers.alpha[..., None])
     if output == "depth":
         return _depth(layers, ends)
     if output == "flow":
         assert layers.flow is not None
-        return colour_wheel(layers.flow / np.float32(ends.fast * max(layers.alpha.shape)))
+        fastest = np.float32(ends.fast * max(layers.alpha.shape))
+        return colour_wheel(layers.flow / fastest * layers.alpha[..., None])
     assert output == "error" and true is not None
-    drawn = _rounded(layers.rgb).astype(np.float32) / 255
+    drawn = eight_bits(layers.rgb).astype(np.float32) / 255
     return turbo(np.abs(drawn - true).mean(2) / FULL_ERROR)
 
 
@@ -113,11 +114,6 @@ def _percentiles(
     if not len(values):
         return otherwise
     return tuple(float(value) for value in np.percentile(values, percents))
-
-
-def _rounded(layer: Floats) -> Pixels:
-    # NaN becomes 0, as in a cast without the warning
-    return np.asarray(np.rint(np.nan_to_num(layer).clip(0, 1) * 255), dtype=np.uint8)
 
 
 def _depth(layers: Layers, ends: Ends) -> Pixels:

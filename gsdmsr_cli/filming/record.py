@@ -94,7 +94,7 @@ class Reel:
             noted = self._noted()
             self._refuse_longer(ours or noted is not None)
             said = {} if anew or noted is None else noted
-            if {**said, "fps": None} != {**self._document(), "fps": None}:
+            if _of_frames(said) != _of_frames(self._document()):
                 self._remove_frames()
             if said.get("fps") != self.fps:
                 self._remove_videos()
@@ -138,6 +138,11 @@ class Reel:
     def _document(self) -> dict[str, Any]:
         about = {"schema": SCHEMA, "gsdmsr": __version__, "output": self.output}
         return {**about, **self.request, "fps": self.fps}
+
+
+def _of_frames(document: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what frames depend on: neither the videos' speed nor where the run lies."""
+    return {key: value for key, value in document.items() if key not in ("fps", "run")}
 
 
 def shots_hash(shots: Sequence[Shot]) -> str:

@@ -88,8 +88,8 @@ def shoot(
             for can in cans:
                 can.add(crew, i, job if can.reel in missing[i] else None)
             tell(i + 1, len(film.shots))
-    drawn = sum(map(bool, missing))
-    return Account(drawn, len(missing) - drawn, drawing, time.perf_counter() - started)
+    drawn, count = sum(map(bool, missing)), max(reel.count for reel in reels)
+    return Account(drawn, count - drawn, drawing, time.perf_counter() - started)
 
 
 @dataclass(frozen=True, eq=False)

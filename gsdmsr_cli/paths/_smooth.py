@@ -1,4 +1,4 @@
-"""Smooth ways through cameras: a spline of their centres, great arcs between their rotations."""
+"""Smooth ways through cameras, which keep what all of them look at in the picture."""
 
 from __future__ import annotations
 
@@ -12,8 +12,14 @@ from numpy.typing import NDArray
 from gsdmsr_cli.camera import Camera
 from gsdmsr_cli.film import Shot
 from gsdmsr_cli.geometry import quat_to_rotmat
-
-Floats = NDArray[np.float64]
+from gsdmsr_cli.paths._quaternions import (
+    Floats,
+    bezier,
+    exponential,
+    multiply,
+    quaternion,
+    turns,
+)
 
 STEP = 1e-3
 """Least length between two keys, so that those at the same place are apart in time."""
@@ -30,8 +36,10 @@ class Key:
 def through(keys: Sequence[Key], knots: Floats, at: Floats) -> list[Shot]:
     """Return the shots at the places ``at`` of the way through two or more ``keys``.
 
-    Centres follow a cubic Hermite spline (C1), rotations SLERP, lenses and time go in a straight
-    line between neighbours. Size is the first camera's; lenses are taken relative to the height.
+    Each camera is taken apart into its rotation, the point on its line of sight that is level with
+    the world's origin, and the distance to that point. So cameras that look at the scene from
+    different sides are joined by a way round it, which keeps it in the picture. Size is the first
+    camera's; lenses, relative to the height, and time go straight from neighbour to neighbour.
 
     Args:
         keys: what is passed through, exactly.
@@ -39,14 +47,17 @@ def through(keys: Sequence[Key], knots: Floats, at: Floats) -> list[Shot]:
         at: (M,) where on the way the shots lie, within the knots.
     """
     cameras = [key.camera for key in keys]
-    centres = hermite(knots, np.stack([camera.centre for camera in cameras]), at)
-    rotations = slerp(knots, np.stack([camera.rotation for camera in cameras]), at)
-    lenses = np.stack([_lens(camera) for camera in cameras])
-    rows = np.column_stack([lenses, [key.time for key in keys]])
-    between = [np.interp(at, knots, column) for column in rows.T]
+    distances = np.array([[max(float(camera.translation[2]), 0.0)] for camera in cameras])
+    centres = np.stack([camera.centre for camera in cameras])
+    targets = centres + distances * np.stack([camera.rotation[2] for camera in cameras])
+    rotations = turned(knots, np.stack([camera.rotation for camera in cameras]), at)
+    far = hermite(knots, distances, at).clip(min=0)
+    places = hermite(knots, targets, at) - far * rotations[:, 2]
+    rows = [[*_lens(key.camera), key.time] for key in keys]
+    between = np.stack([np.interp(at, knots, column) for column in np.array(rows).T], axis=1)
     return [
-        Shot(_camera(cameras[0], centre, rotation, row[:4]), float(row[4]))
-        for centre, rotation, row in zip(centres, rotations, np.stack(between, 1), strict=True)
+        Shot(_camera(cameras[0], place, rotation, row[:4]), float(row[4]))
+        for place, rotation, row in zip(places, rotations, between, strict=True)
     ]
 
 
@@ -60,69 +71,52 @@ def lengths(keys: Sequence[Key]) -> Floats:
     scale = max(float(np.linalg.norm(centres, axis=1).mean()), 1e-12)
     ways = np.linalg.norm(np.diff(centres, axis=0), axis=1) / scale
     quats = np.stack([quaternion(key.camera.rotation) for key in keys])
-    cosines = np.abs(np.sum(quats[1:] * quats[:-1], axis=1)).clip(0, 1)
+    angles = np.linalg.norm(turns(quats), axis=1)
     passed = np.abs(np.diff([key.time for key in keys]))
-    return np.asarray(np.maximum(ways + 2 * np.arccos(cosines) + passed, STEP))
+    return np.asarray(np.maximum(ways + angles + passed, STEP))
 
 
 def hermite(knots: Floats, values: Floats, at: Floats) -> Floats:
-    """Return the (M, D) points at ``at`` of a cubic Hermite spline through ``values``, (K, D).
-
-    Slopes at inner knots are those of the parabola through three neighbours, at the ends those of
-    the parabola through the last three; two values are joined by a line.
-    """
+    """Return the (M, D) points at ``at`` of a cubic Hermite spline through ``values``, (K, D)."""
     steps = np.diff(knots)[:, None]
-    slopes = np.diff(values, axis=0) / steps
-    if len(values) == 2:
-        tangents = np.repeat(slopes, 2, axis=0)
-    else:
-        inner = (slopes[:-1] * steps[1:] + slopes[1:] * steps[:-1]) / (steps[1:] + steps[:-1])
-        tangents = np.concatenate([2 * slopes[:1] - inner[:1], inner, 2 * slopes[-1:] - inner[-1:]])
+    tangents = _tangents(np.diff(values, axis=0) / steps, steps)
     i, u = _segment(knots, at)
     u, h = u[:, None], steps[i]
-    start, end = values[i], values[i + 1]
     return np.asarray(
-        (1 + 2 * u) * (1 - u) ** 2 * start
+        (1 + 2 * u) * (1 - u) ** 2 * values[i]
         + u * (1 - u) ** 2 * h * tangents[i]
-        + u**2 * (3 - 2 * u) * end
+        + u**2 * (3 - 2 * u) * values[i + 1]
         - u**2 * (1 - u) * h * tangents[i + 1]
     )
 
 
-def slerp(knots: Floats, rotations: Floats, at: Floats) -> Floats:
-    """Return the (M, 3, 3) rotations at ``at`` on the shortest arcs between (K, 3, 3) ones."""
-    quats = np.stack([quaternion(rotation) for rotation in rotations])
-    for quat, before in zip(quats[1:], quats, strict=False):
-        if quat @ before < 0:  # of the two that mean the same rotation, the nearer one
-            quat *= -1
-    i, u = _segment(knots, at)
-    start, end = quats[i], quats[i + 1]
-    angle = np.arccos(np.sum(start * end, axis=1).clip(-1, 1))
-    sine = np.sin(angle)
-    straight = sine < 1e-9
-    safe = np.where(straight, 1.0, sine)
-    a = np.where(straight, 1 - u, np.sin((1 - u) * angle) / safe)[:, None]
-    b = np.where(straight, u, np.sin(u * angle) / safe)[:, None]
-    return np.asarray(quat_to_rotmat(torch.from_numpy(a * start + b * end)).numpy())
+def turned(knots: Floats, rotations: Floats, at: Floats) -> Floats:
+    """Return the (M, 3, 3) rotations at ``at`` on a smooth way through (K, 3, 3) ones.
 
-
-def quaternion(rotation: Floats) -> Floats:
-    """Return the unit quaternion wxyz of a (3, 3) rotation, w >= 0.
-
-    The eigenvector of the largest eigenvalue of a symmetric 4x4 matrix (Bar-Itzhack 2000), which
-    has no special cases and takes the nearest rotation where the matrix is not quite one.
+    The same spline among rotations: Bezier curves of arcs (Shoemake 1985), which between two
+    rotations alone are SLERP. Neighbours are joined the shorter way.
     """
-    (a, b, c), (d, e, f), (g, h, i) = rotation
-    k = np.array(
-        [
-            [a + e + i, h - f, c - g, d - b],
-            [h - f, a - e - i, b + d, c + g],
-            [c - g, b + d, e - a - i, f + h],
-            [d - b, c + g, f + h, i - a - e],
-        ]
-    )
-    largest = np.linalg.eigh(k)[1][:, -1]
-    return np.asarray(-largest if largest[0] < 0 else largest)
+    quats = np.stack([quaternion(rotation) for rotation in rotations])
+    steps = np.diff(knots)[:, None]
+    thirds = _tangents(turns(quats) / steps, steps) / 3
+    i, u = _segment(knots, at)
+    start, end, h = quats[i], quats[i + 1], steps[i]
+    leaving = multiply(start, exponential(thirds[i] * h))
+    arriving = multiply(end, exponential(-thirds[i + 1] * h))
+    quats_between = torch.from_numpy(bezier([start, leaving, arriving, end], u))
+    return np.asarray(quat_to_rotmat(quats_between).numpy())
+
+
+def _tangents(slopes: Floats, steps: Floats) -> Floats:
+    """Return the (K, D) derivatives at the knots of a curve with (K - 1, D) mean slopes.
+
+    At inner knots that of the parabola through three neighbours, at the ends that of the parabola
+    through the last three; two values are joined by a line.
+    """
+    if len(slopes) == 1:
+        return np.repeat(slopes, 2, axis=0)
+    inner = (slopes[:-1] * steps[1:] + slopes[1:] * steps[:-1]) / (steps[1:] + steps[:-1])
+    return np.concatenate([2 * slopes[:1] - inner[:1], inner, 2 * slopes[-1:] - inner[-1:]])
 
 
 def _segment(knots: Floats, at: Floats) -> tuple[NDArray[np.int64], Floats]:
