@@ -16,6 +16,7 @@ import typer
 from gsdmsr_cli import __version__, cli, commands
 from gsdmsr_cli.benchmark.trials import Terms
 from gsdmsr_cli.errors import DataError, GsdmsrError, ThresholdError, UsageError
+from gsdmsr_cli.filming.request import Request
 from gsdmsr_cli.preset import load_preset
 
 COMMANDS = (
@@ -104,11 +105,39 @@ def test_version(gsdmsr: Gsdmsr, capsys: pytest.CaptureFixture[str]) -> None:
             "eval",
             (Path("r"), "val", "black", 2, Path("w"), True, ["psnr=25", "ssim=0.9"], Path("d")),
         ),
-        ("render r", "render", (Path("r"), None, None, None, None)),
+        ("render r", "render", (Path("r"), Request(), None, None)),
         (
             "render r --path orbit --frames 9 --out o --data d",
             "render",
-            (Path("r"), "orbit", 9, Path("o"), Path("d")),
+            (Path("r"), Request("orbit", 9), Path("o"), Path("d")),
+        ),
+        (
+            "render r --path interpolate --view a --view test/b --time 0.5 --fps 24"
+            " --output depth,rgb --video webm,mp4 --size 64x32 --supersample 2 --overwrite",
+            "render",
+            (
+                Path("r"),
+                Request(
+                    "interpolate",
+                    None,
+                    ("a", "test/b"),
+                    0.5,
+                    24.0,
+                    ("rgb", "depth"),
+                    ("webm", "mp4"),
+                    (64, 32),
+                    None,
+                    2,
+                    True,
+                ),
+                None,
+                None,
+            ),
+        ),
+        (
+            "render r --video none --scale 0.5",
+            "render",
+            (Path("r"), Request(videos=(), scale=0.5), None, None),
         ),
         (
             "export r --format ply --time 0.5 --out o",
@@ -192,6 +221,21 @@ def test_a_budget_without_a_unit_is_refused_as_text(gsdmsr: Gsdmsr) -> None:
         ("eval r --split train", "--split"),
         ("eval r --downscale 0", "--downscale"),
         ("render r --frames 0", "--frames"),
+        ("render r --output rgb,dept", "--output: unknown 'dept'; did you mean 'depth'?"),
+        ("render r --output ,", "--output: unknown ''"),
+        ("render r --video mp3", "--video: unknown 'mp3'; did you mean 'mp4'?"),
+        ("render r --size 400", "--size is '400'; allowed: WxH"),
+        ("render r --size 0x4", "--size is '0x4'; allowed: WxH"),
+        ("render r --size 99999x4", "both 1 to 16384 px"),
+        ("render r --size 4x4 --scale 2", "--size and --scale"),
+        ("render r --scale 0", "--scale is 0; allowed: more than 0"),
+        ("render r --scale nan", "--scale is nan; allowed"),
+        ("render r --fps 0", "--fps is 0; allowed"),
+        ("render r --time 1.5", "--time"),
+        ("render r --supersample 9", "--supersample"),
+        ("render r --path still --time 0.5", "--path still stops the camera; drop one"),
+        ("render r --output flow --frames 1", "--frames 1 has no next"),
+        ("render r --view a", "--view needs a --path"),
         ("export r --format obj --out o", "--format"),
         ("export r --format ply --time 1.5 --out o", "--time"),
         ("benchmark", "missing command"),

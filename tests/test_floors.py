@@ -11,7 +11,7 @@ import pytest
 import gsdmsr_cli
 
 PACKAGE = Path(gsdmsr_cli.__file__).parent
-PLUGINS = ("motion", "raster", "formats", "exports")
+PLUGINS = ("motion", "raster", "formats", "exports", "paths")
 
 
 def imports(path: Path, root: Path = PACKAGE) -> set[str]:

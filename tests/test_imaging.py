@@ -201,6 +201,81 @@ def test_area_resize_weights_partly_covered_pixels() -> None:
     np.testing.assert_allclose(imaging.resize_area(image, 2, 2)[0, :, 0], halves, atol=1e-6)
 
 
+@pytest.mark.parametrize("channels", [("Z",), ("u", "v")])
+def test_exr_holds_the_numbers_exactly(tmp_path: Path, channels: tuple[str, ...]) -> None:
+    image = np.random.default_rng(3).normal(size=(7, 5, len(channels))).astype(np.float32)
+    image[0, 0], image[1, 1], image[2, 2] = np.inf, 1e-30, -123456.78
+    imaging.write_exr(tmp_path / "a.exr", image, channels)
+    read, names = imaging.read_exr(tmp_path / "a.exr")
+    assert names == channels and read.dtype == np.float32
+    np.testing.assert_array_equal(read, image)
+    assert imaging.image_size(tmp_path / "a.exr") == (5, 7)
+    assert [path.name for path in tmp_path.iterdir()] == ["a.exr"]
+
+
+def test_an_exr_that_cannot_be_written_is_told(tmp_path: Path) -> None:
+    path = tmp_path / "missing" / "a.exr"
+    with pytest.raises(DataError, match="No such file or directory") as error:
+        imaging.write_exr(path, np.zeros((2, 2, 1), np.float32), ("Z",))
+    assert_one_line(error, path)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="needs a limit on the size of files")
+def test_an_exr_that_does_not_fit_on_the_disk_leaves_nothing(tmp_path: Path) -> None:
+    program = f"""
+import resource, signal
+from pathlib import Path
+import numpy as np
+from gsdmsr_cli import imaging
+from gsdmsr_cli.errors import DataError
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+resource.setrlimit(resource.RLIMIT_FSIZE, (20000, 20000))
+image = np.random.default_rng(0).random((100, 100, 1)).astype(np.float32)
+try:
+    imaging.write_exr(Path({str(tmp_path / "a.exr")!r}), image, ("Z",))
+except DataError as error:
+    print(error)
+"""
+    run = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert "a.exr: cannot be written" in run.stdout, run.stderr
+    assert run.stdout.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_eight_bits_are_clamped_and_rounded_as_eval_rounds() -> None:
+    values = np.linspace(-0.2, 1.2, 70 * 61 * 3, dtype=np.float32).reshape(3, 70, 61)
+    image = values.transpose(1, 2, 0)  # planes, as engines draw them
+    expected = np.rint(image.clip(0, 1) * np.float32(255)).astype(np.uint8)
+    np.testing.assert_array_equal(imaging.eight_bits(image), expected)
+    np.testing.assert_array_equal(imaging.eight_bits(image[..., :1]), expected[..., :1])
+    assert imaging.eight_bits(np.full((1, 1, 1), np.nan, np.float32)) == 0
+
+
+def test_turbo_goes_from_blue_over_green_to_red() -> None:
+    low, middle, high, beyond = imaging.turbo(np.array([[0.1, 0.5, 0.95, 7.0]], np.float32))[0]
+    assert low.argmax() == 2 and middle.argmax() == 1 and high.argmax() == 0
+    assert beyond[0] > 100 and beyond[1:].max() < 30  # clamped to dark red
+
+
+@pytest.mark.parametrize(
+    ("vector", "colour"),
+    [
+        ((0, 0), (255, 255, 255)),
+        ((1, 0), (255, 0, 0)),
+        ((0, 1), (128, 255, 0)),
+        ((-1, 0), (0, 255, 255)),
+        ((0, -1), (128, 0, 255)),
+        ((9, 0), (255, 0, 0)),
+        ((0.5, 0), (255, 128, 128)),
+    ],
+)
+def test_the_colour_wheel_turns_clockwise_from_red(
+    vector: tuple[float, float], colour: tuple[int, int, int]
+) -> None:
+    found = imaging.colour_wheel(np.array([[vector]], np.float32))
+    assert np.abs(found[0, 0].astype(int) - colour).max() <= 1
+
+
 def read_video(path: Path) -> list[np.ndarray]:
     capture = cv2.VideoCapture(str(path))
     frames = []
