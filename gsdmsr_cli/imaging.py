@@ -276,7 +276,8 @@ def _encode(
         for frame in frames:
             if frame.shape != shape:
                 raise ValueError(f"frame {written} has shape {frame.shape}, not {shape}")
-            writer.write(cv2.cvtColor(np.pad(frame, pad, mode="edge"), cv2.COLOR_RGB2BGR))
+            even = np.pad(frame, pad, mode="edge") if height % 2 or width % 2 else frame
+            writer.write(cv2.cvtColor(even, cv2.COLOR_RGB2BGR))
             written += 1
     finally:
         writer.release()
