@@ -16,10 +16,11 @@ import torch
 from datasets import noise, write_json, write_picture
 from kernel_checks import generator
 
-from gsdmsr_cli import formats, plugins
+from gsdmsr_cli import formats, paths, plugins
 from gsdmsr_cli import motion as motions
 from gsdmsr_cli.errors import DataError, UsageError
 from gsdmsr_cli.fields.planes import CUBE
+from gsdmsr_cli.film import PathOptions
 from gsdmsr_cli.formats import dnerf, read_scene
 from gsdmsr_cli.model import Model, load_model
 from gsdmsr_cli.motion import Facts, start_motion
@@ -63,6 +64,24 @@ def linear(tmp_path: Path) -> Iterator[ModuleType]:
 @pytest.fixture
 def turntable(tmp_path: Path) -> Iterator[ModuleType]:
     yield from installed(formats, "turntable", "adding-a-format.md", tmp_path)
+
+
+@pytest.fixture
+def swing(tmp_path: Path) -> Iterator[ModuleType]:
+    yield from installed(paths, "swing", "adding-a-path.md", tmp_path)
+
+
+def test_the_example_of_a_path_swings(swing: ModuleType, tiny_scene: Path) -> None:
+    scene = read_scene(tiny_scene)
+    shots = paths.make_film(scene, "swing", PathOptions(9)).shots
+    bearings = [np.arctan2(*shot.camera.centre[1::-1]) for shot in shots]
+    turned = np.degrees(np.unwrap(bearings) - bearings[0])
+    expected = 30 * np.sin(2 * np.pi * np.arange(9) / 8)
+    np.testing.assert_allclose(turned, expected, atol=1e-6)
+    assert [shot.time for shot in shots] == [i / 8 for i in range(9)]
+    assert len(paths.make_film(scene, "swing", PathOptions()).shots) == 90
+    with pytest.raises(UsageError, match="--view is not for --path swing"):
+        paths.make_film(scene, "swing", PathOptions(views=("test/r_000",)))
 
 
 def splats_of(count: int) -> Splats:
@@ -177,7 +196,7 @@ def test_links_between_pages_lead_somewhere(page: Path) -> None:
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_paths_of_the_package_that_pages_name_exist(page: Path) -> None:
-    examples = {"gsdmsr_cli/motion/linear.py", "gsdmsr_cli/formats/turntable.py"}
+    examples = {f"gsdmsr_cli/{n}.py" for n in ("motion/linear", "formats/turntable", "paths/swing")}
     text = page.read_text(encoding="utf-8")
     for path in set(re.findall(r"\b(?:gsdmsr_cli|tests|presets)/[\w/]+\.(?:py|yaml)", text)):
         assert (ROOT / path).is_file() or path in examples | {"presets/linear.yaml"}, path

@@ -86,13 +86,14 @@ class Reel:
             anew: keep nothing.
 
         Raises:
-            DataError: the folder holds more frames than this film, which may not be removed; or
-                cannot be written, or the note's place is taken by something else.
+            DataError: the folder holds frames that may not be removed, or cannot be written, or
+                the note's place is taken by something else.
         """
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
             noted = self._noted()
-            self._refuse_longer(ours or noted is not None)
+            if noted is None and not ours:
+                self._refuse_foreign()
             said = {} if anew or noted is None else noted
             if _of_frames(said) != _of_frames(self._document()):
                 self._remove_frames()
@@ -118,12 +119,15 @@ class Reel:
     def _frames(self) -> list[Path]:
         return sorted(path for path in self.folder.iterdir() if _FRAME.fullmatch(path.name))
 
-    def _refuse_longer(self, ours: bool) -> None:
-        longer = [path for path in self._frames() if int(path.stem) >= self.count]
-        if longer and not ours:
+    def _refuse_foreign(self) -> None:
+        """Raise DataError if there are files of the film's names that no note speaks of."""
+        videos = [self.video(kind) for kind in VIDEOS if self.video(kind).exists()]
+        found = [*self._frames(), *videos]
+        if found:
             raise DataError(
-                f"{self.folder}: holds {len(longer)} pictures of a longer film, {longer[0].name} "
-                "the first; empty it or choose another --out"
+                f"{self.folder}: there are {len(found)} pictures or videos already that are not "
+                f"known to be of gsdmsr, {found[0].name} the first; empty it or choose another "
+                "--out"
             )
 
     def _remove_frames(self) -> None:

@@ -328,15 +328,30 @@ def test_a_folder_that_cannot_be_written_is_told_before_drawing(
     assert blocked.read_text() == '{"tour": "of somebody else"}'
 
 
-def test_pictures_of_somebody_elses_longer_film_are_refused(
-    render: Render, tmp_path: Path, capsys: Any
+@pytest.mark.parametrize("name", ["orbit/0007.png", "orbit/0000.png", "orbit.mp4"])
+def test_files_of_somebody_else_are_refused(
+    render: Render, tmp_path: Path, capsys: Any, name: str
 ) -> None:
-    folder = tmp_path / "out" / "orbit"
-    folder.mkdir(parents=True)
-    (folder / "0007.png").touch()
+    path = tmp_path / "out" / name
+    path.parent.mkdir(parents=True)
+    path.touch()
     assert render("--path orbit --frames 2") == 3
-    assert "holds 1 pictures of a longer film, 0007.png the first" in one_line(capsys)
-    assert (folder / "0007.png").exists()
+    message = f"1 pictures or videos already that are not known to be of gsdmsr, {path.name} the"
+    assert message in one_line(capsys)
+    assert path.stat().st_size == 0
+
+
+def test_the_runs_own_folder_is_cleared(run: Path, monkeypatch: Any) -> None:
+    path = run / "render" / "orbit" / "0007.png"
+    path.parent.mkdir(parents=True)
+    path.touch()
+    monkeypatch.setattr(
+        sys, "argv", ["gsdmsr", "render", str(run), *["--path", "orbit", "--frames", "2"]]
+    )
+    with pytest.raises(SystemExit) as ended:
+        cli.main()
+    assert ended.value.code == 0
+    assert sorted(stamps(path.parent)) == ["0000.png", "0001.png"]
 
 
 def test_a_full_disk_ends_the_film_in_one_line(
