@@ -25,6 +25,7 @@ class View:
         split: "train", "val" or "test".
         image_path: the picture, RGB or RGBA with straight alpha, or grey.
         mask_path: optional picture, white where pixels count.
+        moving_path: optional picture, white where the scene moves.
     """
 
     name: str
@@ -33,6 +34,7 @@ class View:
     split: str
     image_path: Path
     mask_path: Path | None = None
+    moving_path: Path | None = None
 
 
 @dataclass(frozen=True, eq=False)
