@@ -241,6 +241,8 @@ class SaliencyOptions:
             taken every 8th time.
         gate_from: progress from which the gate works, once the motion has begun.
         threshold: saliency above which a splat is high, see ``training.saliency.step_saliency``.
+        quantile: if above 0, the threshold is instead the saliency below which this share of all
+            splats lies.
         release: share of the threshold below which a splat is low; between the two it stays what
             it is.
         low_rate: learning rate of low splats in units of the others'.
@@ -260,6 +262,7 @@ class SaliencyOptions:
     gate: Literal["none", "scale", "freeze", "sparse"] = "none"
     gate_from: float = 0.35
     threshold: float = 1e-3
+    quantile: float = 0.0
     release: float = 0.5
     low_rate: float = 0.01
     units: Literal["drawn", "raw"] = "drawn"
@@ -274,6 +277,7 @@ class SaliencyOptions:
     def __post_init__(self) -> None:
         _require_progress(self, "gate_from", "still_from")
         _require_positive(self, "threshold", "low_rate", "still_below")
+        require(self, "quantile", 0.0 <= self.quantile <= 1.0, "0 to 1")
         require(self, "release", 0.0 < self.release <= 1.0, "above 0, at most 1")
         require(self, "smoothing", 0.0 <= self.smoothing < 1.0, "0 or more, below 1")
         _require_at_least(self, 0, "hold", "grace", "field_every")

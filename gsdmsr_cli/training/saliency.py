@@ -67,12 +67,19 @@ class Saliency:
         smoothed = o.smoothing * self.scores + (1 - o.smoothing) * now
         self.scores = torch.where(seen & now.isfinite(), smoothed, self.scores)
         self.grace = (self.grace - 1).clamp(min=0)
-        rises = ~self.high & (self.scores > o.threshold)
-        falls = self.high & (self.scores < o.release * o.threshold) & (self.grace == 0)
+        threshold = self._threshold()
+        rises = ~self.high & (self.scores > threshold)
+        falls = self.high & (self.scores < o.release * threshold) & (self.grace == 0)
         changes = (rises | falls) & (self.age >= o.hold)
         self.high = self.high ^ changes
         self.age = (self.age + 1).masked_fill(changes, 0)
         return changes & self.high
+
+    def _threshold(self) -> float:
+        quantile, count = self.options.quantile, len(self.scores)
+        if quantile == 0 or count == 0:
+            return self.options.threshold
+        return float(self.scores.kthvalue(max(1, round(quantile * count))).values)
 
     def take(self, rows: Tensor, fresh: Tensor) -> None:
         """Follow a resize; rows that are ``fresh`` (M,) begin high, in grace."""

@@ -88,6 +88,15 @@ def classes(saliency: Saliency, scores: Sequence[float]) -> list[bool]:
     return found
 
 
+@pytest.mark.parametrize("quantile, low", [(0.3, 2), (0.5, 4), (1.0, 9)])
+def test_a_quantile_makes_that_share_of_the_splats_low(quantile: float, low: int) -> None:
+    """Scores 1 to 10: those below the k-th smallest are low, whatever the threshold."""
+    scores = torch.randperm(10, generator=generator(2)) + 1.0
+    saliency = saliency_of(10, threshold=1e9, quantile=quantile, release=1.0)
+    saliency.observe(scores, torch.ones(10, dtype=torch.bool))
+    assert (~saliency.high).tolist() == [score <= low for score in scores.tolist()]
+
+
 def test_between_release_and_threshold_the_class_stays() -> None:
     saliency = saliency_of(threshold=1.0, release=0.5)
     scores = [0.7, 0.4, 0.7, 0.9, 1.1, 0.6, 0.49]
