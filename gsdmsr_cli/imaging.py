@@ -184,6 +184,24 @@ def resize_area(image: NDArray[np.float32], width: int, height: int) -> NDArray[
     return np.asarray(resized, dtype=np.float32)
 
 
+def resample(
+    image: NDArray[np.float32],
+    columns: NDArray[np.float32],
+    rows: NDArray[np.float32],
+    sharply: bool = True,
+) -> NDArray[np.float32]:
+    """Return (H, W) or (H, W, C) pixels, each taken from a place of ``image`` between its pixels.
+
+    Args:
+        columns, rows: (H, W) places, counted from the centre of the first pixel; what lies beyond
+            the border is as the border.
+        sharply: cubic interpolation, which may overshoot a little; else linear.
+    """
+    how = cv2.INTER_CUBIC if sharply else cv2.INTER_LINEAR
+    taken = cv2.remap(image, columns, rows, how, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(taken, dtype=np.float32)
+
+
 def write_webm(path: Path, frames: Iterable[NDArray[np.uint8]], fps: float) -> None:
     """Write (H, W, 3) RGB frames as a VP8 video that browsers play, whole or not at all.
 

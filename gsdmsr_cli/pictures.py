@@ -7,6 +7,7 @@ import threading
 from collections import OrderedDict
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
+from functools import lru_cache
 from itertools import accumulate
 from pathlib import Path
 
@@ -18,9 +19,10 @@ from torch import Tensor
 from gsdmsr_cli import imaging
 from gsdmsr_cli.camera import Camera
 from gsdmsr_cli.errors import DataError, UsageError
+from gsdmsr_cli.lens import Lens
 from gsdmsr_cli.scene import View
 
-_Key = tuple[Path, int, int]
+_Key = tuple[Path, int, int, Lens | None, bool]
 
 
 class Pictures:
@@ -61,13 +63,35 @@ class Pictures:
             DataError: the file cannot be read or has another size than the view's camera.
             UsageError: as ``camera``.
         """
-        key = (view.image_path, view.camera.width, view.camera.height)
+        return self._cached(view, view.image_path)
+
+    def counted(self, view: View) -> Tensor | None:
+        """Return which pixels of the view's picture count, (h, w) bool, or None for all.
+
+        Raises:
+            DataError, UsageError: as ``load``.
+        """
+        return self._mask(view, view.mask_path)
+
+    def moving(self, view: View) -> Tensor | None:
+        """Return which pixels of the view's picture move, (h, w) bool, or None if that is unknown.
+
+        Raises:
+            DataError, UsageError: as ``load``.
+        """
+        return self._mask(view, view.moving_path)
+
+    def _mask(self, view: View, path: Path | None) -> Tensor | None:
+        return None if path is None else self._cached(view, path, is_mask=True)
+
+    def _cached(self, view: View, path: Path, is_mask: bool = False) -> Tensor:
+        key = (path, view.camera.width, view.camera.height, view.lens, is_mask)
         with self._lock:
             if key in self._cache:
                 self._cache.move_to_end(key)
                 return self._cache[key]
         # Decoded outside the lock: two threads may decode the same picture, but none waits.
-        picture = self._decode(view)
+        picture = (self._decode_mask if is_mask else self._decode)(view, path)
         with self._lock:
             if key not in self._cache:
                 self._cache[key] = picture
@@ -106,16 +130,23 @@ class Pictures:
             )
         return round(width / self._downscale), round(height / self._downscale)
 
-    def _decode(self, view: View) -> Tensor:
-        image = imaging.read_image(view.image_path)
-        height, width, _ = image.shape
-        if (width, height) != (view.camera.width, view.camera.height):
-            raise DataError(
-                f"image {view.image_path} is {width} x {height} px, but its camera is "
-                f"{view.camera.width} x {view.camera.height}; they must agree"
-            )
+    def _decode(self, view: View, path: Path) -> Tensor:
+        image = _read(view, path)
         size = self._size(view) if self._downscale > 1 else None
-        return _planes(imaging.composite(image, self._background, size) * 255)
+        if view.lens is None:
+            return _planes(imaging.composite(image, self._background, size) * 255)
+        pixels = imaging.resample(imaging.composite(image, self._background), *_sources(view.lens))
+        return _planes((pixels if size is None else imaging.resize_area(pixels, *size)) * 255)
+
+    def _decode_mask(self, view: View, path: Path) -> Tensor:
+        """Return where a mask is white, or shows white in at least half of a shrunk pixel."""
+        image = _read(view, path)
+        white = (image[..., : 3 if image.shape[2] > 3 else None].max(axis=2) > 127).astype("f4")
+        if view.lens is not None:
+            white = imaging.resample(white, *_sources(view.lens), sharply=False)
+        if self._downscale > 1:
+            white = imaging.resize_area(white, *self._size(view))
+        return torch.from_numpy(white >= 0.5)
 
 
 class HalvedPictures:
@@ -142,6 +173,23 @@ class HalvedPictures:
             whole = self._pictures.load(view).permute(1, 2, 0).numpy().astype(np.float32)
             self._halved[key] = _planes(imaging.resize_area(whole, camera.width, camera.height))
         return self._halved[key]
+
+
+def _read(view: View, path: Path) -> NDArray[np.uint8]:
+    """Return the pixels of one of the view's files, which must have the size of its camera."""
+    image = imaging.read_image(path)
+    height, width, _ = image.shape
+    if (width, height) != (view.camera.width, view.camera.height):
+        raise DataError(
+            f"image {path} is {width} x {height} px, but its camera is "
+            f"{view.camera.width} x {view.camera.height}; they must agree"
+        )
+    return image
+
+
+@lru_cache(maxsize=4)
+def _sources(lens: Lens) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    return lens.sources()
 
 
 def _planes(pixels: NDArray[np.float32]) -> Tensor:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from gsdmsr_cli.camera import Camera
 from gsdmsr_cli.errors import DataError
+from gsdmsr_cli.lens import Lens
 
 SPLITS = ("train", "val", "test")
 
@@ -20,12 +21,14 @@ class View:
 
     Attributes:
         name: unique name within its split, for reports.
-        camera: camera at the full resolution of the file.
+        camera: camera at the full resolution of the file; a pinhole, where there is a ``lens``
+            that which its undistorted picture has.
         time: moment in [0, 1].
         split: "train", "val" or "test".
         image_path: the picture, RGB or RGBA with straight alpha, or grey.
         mask_path: optional picture, white where pixels count.
         moving_path: optional picture, white where the scene moves.
+        lens: what the files were recorded through, the masks as well; None for a pinhole.
     """
 
     name: str
@@ -35,6 +38,7 @@ class View:
     image_path: Path
     mask_path: Path | None = None
     moving_path: Path | None = None
+    lens: Lens | None = None
 
 
 @dataclass(frozen=True, eq=False)

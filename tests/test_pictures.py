@@ -185,3 +185,43 @@ def test_halved_pictures_are_made_once_and_kept_by_split(
     assert not torch.equal(halved.load(views[0]), halved.load(twin))
     halved.load(twin)
     assert decoded == {"0": 1, "1": 1}
+
+
+def test_masks_are_white_or_not_in_any_format_and_at_any_size(tmp_path: Path) -> None:
+    white = np.zeros((6, 8), bool)
+    white[:4, 1:6] = True
+    grey = np.where(white, 255, 0).astype(np.uint8)[..., None]
+    opaque = np.concatenate([grey, grey, grey, np.full_like(grey, 255)], axis=2)
+    for name, pixels in (("grey", grey), ("rgb", grey.repeat(3, 2)), ("rgba", opaque)):
+        write_picture(tmp_path / f"{name}.png", pixels)
+        path = tmp_path / f"{name}.png"
+        view = replace(make_view(path, 8, 6), mask_path=path, moving_path=path)
+        pictures = Pictures(WHITE, 1, 1 << 20)
+        for found in (pictures.counted(view), pictures.moving(view)):
+            assert found is not None and found.dtype == torch.bool
+            assert (found.numpy() == white).all()
+        # a pixel of half the size is white where at least two of its four are
+        half = Pictures(WHITE, 2, 1 << 20).counted(view)
+        shares = white.reshape(3, 2, 4, 2).mean(axis=(1, 3))
+        assert half is not None and (half.numpy() == (shares >= 0.5)).all()
+
+
+def test_a_view_without_masks_has_none(views: list[View]) -> None:
+    pictures = Pictures(WHITE, 1, 1 << 20)
+    assert pictures.counted(views[0]) is None and pictures.moving(views[0]) is None
+
+
+def test_a_mask_and_the_picture_of_one_file_are_not_mixed_up(views: list[View]) -> None:
+    pictures = Pictures(WHITE, 1, 1 << 20)
+    view = replace(views[0], mask_path=views[0].image_path)
+    assert pictures.load(view).shape == (3, SIDE, SIDE)
+    counted = pictures.counted(view)
+    assert counted is not None and counted.shape == (SIDE, SIDE)
+    assert pictures.load(view).shape == (3, SIDE, SIDE)
+
+
+def test_a_mask_of_another_size_is_refused(tmp_path: Path, views: list[View]) -> None:
+    write_picture(tmp_path / "mask.png", noise(4, 4, 1))
+    view = replace(views[0], mask_path=tmp_path / "mask.png")
+    with pytest.raises(DataError, match=r"mask\.png is 4 x 4 px, but its camera is 8 x 8"):
+        Pictures(WHITE, 1, 1 << 20).counted(view)

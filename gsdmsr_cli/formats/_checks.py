@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any
 
@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsdmsr_cli.errors import DataError
+from gsdmsr_cli.scene import View
 
 EXTENSIONS = (".png", ".jpg", ".jpeg")
 """Tried in turn after a picture's path that names no file as it stands."""
@@ -63,6 +64,30 @@ def number(value: object, where: str) -> float:
         if math.isfinite(result):
             return result
     raise DataError(f"{where} is {_shown(value)}; it must be a finite number")
+
+
+def positive(value: object, where: str) -> float:
+    """Return ``value`` if it is a finite number above 0, else raise DataError."""
+    result = number(value, where)
+    if result <= 0:
+        raise DataError(f"{where} is {result}; it must be above 0")
+    return result
+
+
+def pixels(value: object, where: str) -> int:
+    """Return ``value`` if it is a whole number above 0, else raise DataError."""
+    result = number(value, where)
+    if result < 1 or result != int(result):
+        raise DataError(f"{where} is {result}; it must be a whole number of pixels")
+    return int(result)
+
+
+def numbers(value: object, count: int, where: str) -> list[float]:
+    """Return ``value`` if it is a list of so many finite numbers, else raise DataError."""
+    listed = sequence(value, where)
+    if len(listed) != count:
+        raise DataError(f"{where} holds {len(listed)} entries; it must hold {count} numbers")
+    return [number(entry, f"{where}: an entry") for entry in listed]
 
 
 def unit_time(value: object, where: str) -> float:
@@ -128,6 +153,30 @@ def picture_path(root: Path, text: object, where: str) -> Path:
         f"{where}: image {root / relative} does not exist, nor with "
         f"{', '.join(EXTENSIONS)}; restore it or remove the frame"
     )
+
+
+def same_shape(said: tuple[int, int], found: tuple[int, int], image: Path) -> None:
+    """Raise DataError unless a picture is of the (width, height) that is said, or resampled.
+
+    Pictures may have been shrunk after their cameras were written, but not cropped.
+    """
+    if abs(said[1] * found[0] / said[0] - found[1]) > 1:
+        raise DataError(
+            f"image {image} is {found[0]} x {found[1]} px, but its camera's size is "
+            f"{said[0]} x {said[1]}; give the picture that the camera belongs to"
+        )
+
+
+def one_size(views: Sequence[View]) -> None:
+    """Raise DataError unless all pictures are of one size."""
+    first = views[0]
+    size = (first.camera.width, first.camera.height)
+    for view in views:
+        if (view.camera.width, view.camera.height) != size:
+            raise DataError(
+                f"image {view.image_path} is {view.camera.width} x {view.camera.height} px, but "
+                f"{first.image_path} is {size[0]} x {size[1]}; all frames must have one size"
+            )
 
 
 def unique_names(names: Iterable[str]) -> list[str]:

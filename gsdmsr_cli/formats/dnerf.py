@@ -47,7 +47,7 @@ def read(folder: Path) -> Scene:
     views = [view for split, path in paths.items() for view in _read_split(folder, split, path)]
     if not any(view.split == "train" for view in views):
         raise DataError(f"{paths['train']}: no train frames; at least one is needed")
-    _check_sizes(views)
+    checks.one_size(views)
     return Scene(
         root=folder,
         layout="dnerf",
@@ -121,7 +121,7 @@ def _read_view(folder: Path, split: str, fields: dict[str, Any], where: str) -> 
     pose = checks.rigid_pose(fields["transform_matrix"], f"{where}: transform_matrix")
     return View(
         name=path.stem,
-        camera=_camera(fields, _world_to_camera(pose), image_size(path), where),
+        camera=_camera(fields, _world_to_camera(pose), path, where),
         time=checks.unit_time(fields["time"], f"{where}: time"),
         split=split,
         image_path=path,
@@ -137,19 +137,19 @@ def _world_to_camera(pose: NDArray[np.float64]) -> NDArray[np.float64]:
 def _camera(
     fields: dict[str, Any],
     world_to_camera: NDArray[np.float64],
-    size: tuple[int, int],
+    image: Path,
     where: str,
 ) -> Camera:
-    """Return the camera at the picture's ``size`` (width, height); w and h may say another."""
+    """Return the camera at the size of the picture ``image``; w and h may say another."""
+    size = image_size(image)
     for key in _DISTORTION_KEYS:
         if checks.number(fields.get(key, 0), f"{where}: {key}") != 0:
             raise DataError(f"{where}: lens distortion ({key}); undistort the pictures first")
-    width, height = (_pixels(fields, key, n, where) for key, n in zip("wh", size, strict=True))
-    # Pictures may have been shrunk after w and h were written, but not cropped.
-    if abs(height * size[0] / width - size[1]) > 1:
-        raise DataError(
-            f"{where}: the image is {size[0]} x {size[1]} px, but w x h is {width} x {height}"
-        )
+    width, height = (
+        checks.pixels(fields.get(key, n), f"{where}: {key}")
+        for key, n in zip("wh", size, strict=True)
+    )
+    checks.same_shape((width, height), size, image)
     fx = _focal(fields, "x", width, where)
     if fx is None:
         raise DataError(f"{where}: no 'camera_angle_x' and no 'fl_x'; one of them is needed")
@@ -165,35 +165,14 @@ def _camera(
     return camera.resized(*size)
 
 
-def _pixels(fields: dict[str, Any], key: str, default: int, where: str) -> int:
-    value = checks.number(fields.get(key, default), f"{where}: {key}")
-    if value < 1 or value != int(value):
-        raise DataError(f"{where}: {key} is {value}; it must be a whole number of pixels")
-    return int(value)
-
-
 def _focal(fields: dict[str, Any], axis: str, size: int, where: str) -> float | None:
     """Return the focal length [px] along ``axis``, or None if the fields do not give it."""
     length, angle = f"fl_{axis}", f"camera_angle_{axis}"
     if length in fields:
-        focal = checks.number(fields[length], f"{where}: {length}")
-        if focal <= 0:
-            raise DataError(f"{where}: {length} is {focal}; it must be above 0")
-        return focal
+        return checks.positive(fields[length], f"{where}: {length}")
     if angle not in fields:
         return None
     field_of_view = checks.number(fields[angle], f"{where}: {angle}")
     if not 0 < field_of_view < math.pi:
         raise DataError(f"{where}: {angle} is {field_of_view}; it must lie in (0, pi) radians")
     return 0.5 * size / math.tan(field_of_view / 2)
-
-
-def _check_sizes(views: list[View]) -> None:
-    first = views[0]
-    size = (first.camera.width, first.camera.height)
-    for view in views:
-        if (view.camera.width, view.camera.height) != size:
-            raise DataError(
-                f"image {view.image_path} is {view.camera.width} x {view.camera.height} px, but "
-                f"{first.image_path} is {size[0]} x {size[1]}; all frames must have one size"
-            )

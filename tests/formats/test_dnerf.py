@@ -252,7 +252,7 @@ BAD: dict[str, tuple[Edit, str]] = {
     "centre a list": (lambda d: d.update(cx=[]), r"cx is \[\]"),
     "width half": (lambda d: d.update(w=10.5), "w is 10.5; it must be a whole number"),
     "width zero": (lambda d: d.update(w=0), "w is 0.0; it must be a whole number"),
-    "other aspect": (lambda d: d.update(w=10, h=10), "10 x 8 px, but w x h is 10 x 10"),
+    "other aspect": (lambda d: d.update(w=10, h=10), "10 x 8 px, but its camera's size is 10 x 10"),
     "distortion": (lambda d: d.update(k1=0.1), r"lens distortion \(k1\)"),
     "another size": (frame(file_path="train/large"), "10 x 8; all frames must have one size"),
     "a truncated image": (frame(file_path="train/cut"), r"cut\.png is damaged"),
