@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import BinaryIO
 
 import numpy as np
 import torch
@@ -12,6 +11,7 @@ from numpy.typing import NDArray
 from gsdmsr_cli.errors import DataError
 from gsdmsr_cli.files import replacing
 from gsdmsr_cli.splats import Splats
+from gsdmsr_cli.vertices import read_vertices
 
 Array = NDArray[np.float32]
 
@@ -22,13 +22,6 @@ _OPACITY = ("opacity",)
 _SCALES = ("scale_0", "scale_1", "scale_2")
 _QUATS = ("rot_0", "rot_1", "rot_2", "rot_3")
 _REST_COUNTS = (0, 9, 24, 45)  # spherical harmonics of degree 0 to 3, without the constant
-
-_TYPES = {
-    "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1",
-    "short": "<i2", "int16": "<i2", "ushort": "<u2", "uint16": "<u2",
-    "int": "<i4", "int32": "<i4", "uint": "<u4", "uint32": "<u4",
-    "float": "<f4", "float32": "<f4", "double": "<f8", "float64": "<f8",
-}  # fmt: skip
 
 
 def write_ply(path: Path, splats: Splats) -> None:
@@ -60,21 +53,10 @@ def read_ply(path: Path) -> Splats:
     """Read a 3DGS PLY; its properties may come in any order and have any scalar type.
 
     Raises:
-        DataError: the file cannot be read, is cut short or is not a binary PLY of splats.
+        DataError: the file cannot be read, is cut short or is not a PLY of splats.
     """
-    try:
-        with path.open("rb") as file:
-            dtype, count = _read_header(path, file)
-            rest = _count_rest(path, dtype.names or ())
-            payload = file.read()
-    except OSError as error:
-        raise DataError(f"cannot read {path}: {error.strerror or error}") from error
-    if len(payload) < count * dtype.itemsize:
-        raise DataError(
-            f"{path} is cut short: {len(payload)} bytes of splats where its header announces "
-            f"{count} times {dtype.itemsize}; copy or export it again"
-        )
-    return _splats(np.frombuffer(payload[: count * dtype.itemsize], dtype), rest)
+    rows = read_vertices(path)
+    return _splats(rows, _count_rest(path, rows.dtype.names or ()))
 
 
 def _column_names(rest: int) -> tuple[str, ...]:
@@ -104,31 +86,6 @@ def _unit_quats(quats: torch.Tensor) -> torch.Tensor:
     wide = quats.double()
     length = wide.norm(dim=1, keepdim=True)
     return torch.where(length == 0, wide.new_tensor([1.0, 0.0, 0.0, 0.0]), wide / length)
-
-
-def _read_header(path: Path, file: BinaryIO) -> tuple[np.dtype[np.void], int]:
-    """Read up to and including ``end_header``; return the row's type and the number of rows."""
-    if file.readline(16).strip() != b"ply":
-        raise DataError(f"{path} is not a PLY file; its first line is not 'ply'")
-    binary, count = False, None
-    element, fields = "", list[tuple[str, str]]()
-    while (line := file.readline(1024)) and line.strip() != b"end_header":
-        match line.decode("ascii", "replace").split():
-            case ["format", "binary_little_endian", "1.0"]:
-                binary = True
-            case ["element", "vertex", number] if element == "" and number.isdecimal():
-                element, count = "vertex", int(number)
-            case ["element", name, _]:
-                element = name
-            case ["property", kind, name] if element == "vertex" and kind in _TYPES:
-                fields.append((name, _TYPES[kind]))
-            case ["property", *_] if element == "vertex":
-                raise DataError(f"{path}: a vertex property has no fixed size: {line!r}")
-    if not (line and binary and count is not None):
-        raise DataError(f"{path} is not a binary_little_endian PLY that starts with vertices")
-    if len(dict(fields)) != len(fields):
-        raise DataError(f"{path} names a vertex property twice")
-    return np.dtype(fields), count
 
 
 def _count_rest(path: Path, known: tuple[str, ...]) -> int:

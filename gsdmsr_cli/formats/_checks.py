@@ -132,27 +132,53 @@ def picture_path(root: Path, text: object, where: str) -> Path:
     Raises:
         DataError: it names nothing, or something outside of ``root``.
     """
-    if not isinstance(text, str) or not text.strip():
-        raise DataError(f"{where} is {_shown(text)}; it must name a picture")
-    relative = text.replace("\\", "/")
-    if PurePosixPath(relative).is_absolute() or PureWindowsPath(relative).drive:
-        raise DataError(f"{where} is {_shown(text)}; it must be relative to {root}")
+    path = _inner_path(root, text, where, ("", *EXTENSIONS))
+    if path is None:
+        raise DataError(
+            f"{where}: image {root / _relative(root, text, where)} does not exist, nor with "
+            f"{', '.join(EXTENSIONS)}; restore it or remove the frame"
+        )
+    return path
+
+
+def inner_path(root: Path, text: object, where: str) -> Path:
+    """Return the file that ``text`` names relative to ``root``.
+
+    Raises:
+        DataError: it names nothing, or something outside of ``root``.
+    """
+    path = _inner_path(root, text, where, ("",))
+    if path is None:
+        raise DataError(
+            f"{where}: {root / _relative(root, text, where)} does not exist; restore it"
+        )
+    return path
+
+
+def _inner_path(root: Path, text: object, where: str, extensions: tuple[str, ...]) -> Path | None:
+    relative = _relative(root, text, where)
     try:
         inside = root.resolve()
-        for extension in ("", *EXTENSIONS):
+        for extension in extensions:
             path = root / (relative + extension)
             if not path.resolve().is_relative_to(inside):
                 raise DataError(
-                    f"{where} is {_shown(text)}, which leads out of {root}; put the picture inside"
+                    f"{where} is {_shown(text)}, which leads out of {root}; put the file inside"
                 )
             if path.is_file():
                 return path
     except (OSError, ValueError, RuntimeError) as error:  # Too long, a null byte, a loop of links.
         raise DataError(f"{where} is {_shown(text)}, which is not a usable path") from error
-    raise DataError(
-        f"{where}: image {root / relative} does not exist, nor with "
-        f"{', '.join(EXTENSIONS)}; restore it or remove the frame"
-    )
+    return None
+
+
+def _relative(root: Path, text: object, where: str) -> str:
+    if not isinstance(text, str) or not text.strip():
+        raise DataError(f"{where} is {_shown(text)}; it must name a file")
+    relative = text.replace("\\", "/")
+    if PurePosixPath(relative).is_absolute() or PureWindowsPath(relative).drive:
+        raise DataError(f"{where} is {_shown(text)}; it must be relative to {root}")
+    return relative
 
 
 def same_shape(said: tuple[int, int], found: tuple[int, int], image: Path) -> None:
@@ -177,6 +203,16 @@ def one_size(views: Sequence[View]) -> None:
                 f"image {view.image_path} is {view.camera.width} x {view.camera.height} px, but "
                 f"{first.image_path} is {size[0]} x {size[1]}; all frames must have one size"
             )
+
+
+def mask_size(mask: Path, size: tuple[int, int], view: View) -> None:
+    """Raise DataError unless a mask's (width, height) is that of the view's picture."""
+    camera = view.camera
+    if size != (camera.width, camera.height):
+        raise DataError(
+            f"mask {mask} is {size[0]} x {size[1]} px, but {view.image_path} is "
+            f"{camera.width} x {camera.height}; they must agree"
+        )
 
 
 def unique_names(names: Iterable[str]) -> list[str]:

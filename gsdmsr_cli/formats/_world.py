@@ -60,6 +60,11 @@ class World:
         return replace(view, camera=replace(camera, world_to_camera=pose))
 
 
+def as_it_is(bound: float) -> World:
+    """Return a world that is settled already."""
+    return World(np.zeros(3), 1.0, bound)
+
+
 def settle(
     views: Sequence[View], points: Floats, depths: tuple[float, float] | None = None
 ) -> World:

@@ -2,28 +2,22 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from gsdmsr_cli.camera import Camera
 from gsdmsr_cli.errors import DataError
 from gsdmsr_cli.formats import _checks as checks
-from gsdmsr_cli.imaging import image_size
+from gsdmsr_cli.formats import _transforms as transforms
 from gsdmsr_cli.scene import SPLITS, Scene, View
 
 SIGN = "transforms_train.json"
 
 BOUND = 1.3
 """Half edge of the box in which D-NeRF's objects stand (METHODS 0.8) [world units]."""
-
-_CAMERA_KEYS = ("camera_angle_x", "camera_angle_y", "fl_x", "fl_y", "cx", "cy", "w", "h")
-_DISTORTION_KEYS = ("k1", "k2", "k3", "k4", "p1", "p2")
 
 
 def matches(folder: Path) -> bool:
@@ -78,7 +72,7 @@ def _frames(document: dict[str, Any], where: str) -> Iterator[tuple[str, dict[st
 
     A frame inherits what it does not say itself from its camera's entry and from the top level.
     """
-    shared = {k: v for k, v in document.items() if k in _CAMERA_KEYS + _DISTORTION_KEYS}
+    shared = {k: v for k, v in document.items() if k in transforms.CAMERA_KEYS}
     if "frames" in document:
         listed = checks.sequence(document["frames"], f"{where}: frames")
         entries = [(f"frame {i}", entry) for i, entry in enumerate(listed)]
@@ -111,68 +105,8 @@ def _camera_frames(camera: dict[str, Any], where: str) -> Iterator[tuple[str, di
 
 
 def _read_view(folder: Path, split: str, fields: dict[str, Any], where: str) -> View:
-    for key in ("file_path", "transform_matrix"):
-        if key not in fields:
-            raise DataError(f"{where}: no '{key}'; every frame needs one")
-    where = f"{where} ({fields['file_path']!s:.60})"
+    where = transforms.require(fields, where)
     if "time" not in fields:
         raise DataError(f"{where}: no 'time'; every frame of a moving scene needs one in [0, 1]")
-    path = checks.picture_path(folder, fields["file_path"], f"{where}: file_path")
-    pose = checks.rigid_pose(fields["transform_matrix"], f"{where}: transform_matrix")
-    return View(
-        name=path.stem,
-        camera=_camera(fields, _world_to_camera(pose), path, where),
-        time=checks.unit_time(fields["time"], f"{where}: time"),
-        split=split,
-        image_path=path,
-    )
-
-
-def _world_to_camera(pose: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Invert a camera-to-world pose in OpenGL axes (y up, z backward) into OpenCV axes."""
-    flipped = pose @ np.diag([1.0, -1.0, -1.0, 1.0])
-    return np.asarray(np.linalg.inv(flipped), dtype=np.float64)
-
-
-def _camera(
-    fields: dict[str, Any],
-    world_to_camera: NDArray[np.float64],
-    image: Path,
-    where: str,
-) -> Camera:
-    """Return the camera at the size of the picture ``image``; w and h may say another."""
-    size = image_size(image)
-    for key in _DISTORTION_KEYS:
-        if checks.number(fields.get(key, 0), f"{where}: {key}") != 0:
-            raise DataError(f"{where}: lens distortion ({key}); undistort the pictures first")
-    width, height = (
-        checks.pixels(fields.get(key, n), f"{where}: {key}")
-        for key, n in zip("wh", size, strict=True)
-    )
-    checks.same_shape((width, height), size, image)
-    fx = _focal(fields, "x", width, where)
-    if fx is None:
-        raise DataError(f"{where}: no 'camera_angle_x' and no 'fl_x'; one of them is needed")
-    camera = Camera(
-        world_to_camera=world_to_camera,
-        fx=fx,
-        fy=_focal(fields, "y", height, where) or fx,
-        cx=checks.number(fields.get("cx", width / 2), f"{where}: cx"),
-        cy=checks.number(fields.get("cy", height / 2), f"{where}: cy"),
-        width=width,
-        height=height,
-    )
-    return camera.resized(*size)
-
-
-def _focal(fields: dict[str, Any], axis: str, size: int, where: str) -> float | None:
-    """Return the focal length [px] along ``axis``, or None if the fields do not give it."""
-    length, angle = f"fl_{axis}", f"camera_angle_{axis}"
-    if length in fields:
-        return checks.positive(fields[length], f"{where}: {length}")
-    if angle not in fields:
-        return None
-    field_of_view = checks.number(fields[angle], f"{where}: {angle}")
-    if not 0 < field_of_view < math.pi:
-        raise DataError(f"{where}: {angle} is {field_of_view}; it must lie in (0, pi) radians")
-    return 0.5 * size / math.tan(field_of_view / 2)
+    time = checks.unit_time(fields["time"], f"{where}: time")
+    return transforms.read_view(folder, split, time, fields, where)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from gsdmsr_cli.errors import DataError
 from gsdmsr_cli.formats import _checks as checks
-from gsdmsr_cli.formats import _world
+from gsdmsr_cli.formats import _points, _world
 from gsdmsr_cli.imaging import image_size
 from gsdmsr_cli.lens import Lens
 from gsdmsr_cli.scene import Scene, View
@@ -49,7 +49,7 @@ def read(folder: Path) -> Scene:
         _read_view(folder, pictures, name, times[name], split) for name, split in splits.items()
     ]
     checks.one_size(views)
-    points = _points(folder / "points.npy")
+    points, colours = _read_points(folder / "points.npy")
     world = _world.settle(views, points, _depths(folder / "scene.json"))
     files = [folder / name for name in ("dataset.json", "metadata.json", "scene.json")]
     cameras = [_camera_path(folder, name) for name in splits]
@@ -58,7 +58,7 @@ def read(folder: Path) -> Scene:
         layout="nerfies",
         views=world.views(views),
         points=world.points(points),
-        colours=np.full(points.shape, 0.5, np.float32),
+        colours=colours,
         duration=None,
         bound=world.bound,
         fingerprint=checks.fingerprint(path for path in [*files, *cameras] if path.is_file()),
@@ -170,18 +170,17 @@ def _world_to_camera(fields: dict[str, Any], path: Path) -> NDArray[np.float64]:
     return pose
 
 
-def _points(path: Path) -> NDArray[np.float64]:
-    """Return the (P, 3) points of the capture, none if there is no such file."""
+def _read_points(path: Path) -> _points.Points:
+    """Return the points of the capture, none if there is no such file."""
     if not path.is_file():
-        return np.zeros((0, 3))
+        return _points.none()
     try:
         points = np.load(path, allow_pickle=False)
     except (OSError, ValueError, EOFError) as error:
         raise DataError(f"{path}: is damaged or holds no numbers: {error}") from error
     if points.ndim != 2 or points.shape[1] != 3 or not np.issubdtype(points.dtype, np.number):
         raise DataError(f"{path}: has shape {points.shape}; it must hold (P, 3) numbers")
-    points = points.astype(np.float64)
-    return np.asarray(points[np.isfinite(points).all(axis=1)])
+    return _points.uncoloured(points.astype(np.float64))
 
 
 def _depths(path: Path) -> tuple[float, float] | None:

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 
 from gsdmsr_cli.errors import DataError
 from gsdmsr_cli.formats import read_scene
-from gsdmsr_cli.formats.dnerf import _world_to_camera
+from gsdmsr_cli.formats._transforms import world_to_camera
 from gsdmsr_cli.scene import Scene
 
 Edit = Callable[[dict[str, Any]], None]
@@ -124,6 +124,18 @@ def test_intrinsics_of_larger_pictures_are_scaled(folder: Path) -> None:
 def test_a_vertical_angle_of_its_own(folder: Path) -> None:
     camera = edited(folder, lambda d: d.update(camera_angle_y=0.5)).split("train")[0].camera
     assert camera.fy == pytest.approx(0.5 * 8 / math.tan(0.25))
+
+
+def test_a_lens_of_all_frames_or_of_one(folder: Path) -> None:
+    def edit(document: dict[str, Any]) -> None:
+        document.update(k1=0.1, k2=-0.02, p1=0.003, p2=0.004, k3=0.005, k4=0.0)
+        document["frames"][1].update(camera_model="OPENCV_FISHEYE", k4=0.01)
+        document["frames"][2].update(camera_model="PINHOLE")
+
+    first, second, third = (view.lens for view in edited(folder, edit).split("train"))
+    assert first is not None and second is not None and third is None
+    assert first.radial == (0.1, -0.02, 0.005) and first.tangential == (0.003, 0.004)
+    assert second.radial == (0.1, -0.02, 0.005, 0.01) and second.fisheye and not first.fisheye
 
 
 def nvfi_camera(frames: list[dict[str, Any]]) -> dict[str, Any]:
@@ -253,7 +265,11 @@ BAD: dict[str, tuple[Edit, str]] = {
     "width half": (lambda d: d.update(w=10.5), "w is 10.5; it must be a whole number"),
     "width zero": (lambda d: d.update(w=0), "w is 0.0; it must be a whole number"),
     "other aspect": (lambda d: d.update(w=10, h=10), "10 x 8 px, but its camera's size is 10 x 10"),
-    "distortion": (lambda d: d.update(k1=0.1), r"lens distortion \(k1\)"),
+    "distortion of another model": (lambda d: d.update(k4=0.1), r"k4 is 0\.1; it must be 0"),
+    "a camera unknown": (
+        lambda d: d.update(camera_model="ORTHO"),
+        r"camera_model is 'ORTHO'; it must be one of SIMPLE_PINHOLE",
+    ),
     "another size": (frame(file_path="train/large"), "10 x 8; all frames must have one size"),
     "a truncated image": (frame(file_path="train/cut"), r"cut\.png is damaged"),
     "no image": (frame(file_path="train/text.png"), r"text\.png is damaged or not a picture"),
@@ -333,7 +349,7 @@ def test_axes_agree_with_an_opengl_pinhole(
     u = cx + focal * local[0] / -local[2]
     v = cy - focal * local[1] / -local[2]
 
-    x, y, z = (_world_to_camera(camera_to_world) @ [*world, 1])[:3]
+    x, y, z = (world_to_camera(camera_to_world) @ [*world, 1])[:3]
     assert z == pytest.approx(-local[2])
     assert focal * x / z + cx == pytest.approx(u, abs=1e-9)
     assert focal * y / z + cy == pytest.approx(v, abs=1e-9)

@@ -1,0 +1,48 @@
+"""Points to start from, as readers give them: positions and colours in [0, 1]."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gsdmsr_cli.errors import DataError
+from gsdmsr_cli.vertices import read_vertices
+
+Points = tuple[NDArray[np.float64], NDArray[np.float32]]
+"""(P, 3) positions and (P, 3) colours."""
+
+GREY = 0.5
+"""Colour of points that have none."""
+
+
+def none() -> Points:
+    """Return no points."""
+    return uncoloured(np.zeros((0, 3)))
+
+
+def uncoloured(points: NDArray[np.float64]) -> Points:
+    """Return the finite ones of (P, 3) points, in grey."""
+    points = points[np.isfinite(points).all(axis=1)]
+    return points, np.full(points.shape, GREY, np.float32)
+
+
+def read_ply(path: Path) -> Points:
+    """Return the points of a PLY file: x y z, and red green blue where it has them.
+
+    Raises:
+        DataError: the file cannot be read or has no positions.
+    """
+    rows = read_vertices(path)
+    names = set(rows.dtype.names or ())
+    if missing := sorted({"x", "y", "z"} - names):
+        raise DataError(f"{path}: its vertices have no {', '.join(missing)}")
+    points = np.stack([rows[axis].astype(np.float64) for axis in "xyz"], axis=1)
+    if not {"red", "green", "blue"} <= names:
+        return uncoloured(points)
+    channels = [rows[name] for name in ("red", "green", "blue")]
+    full = 1.0 if np.issubdtype(channels[0].dtype, np.floating) else 255.0
+    colours = np.stack(channels, axis=1).astype(np.float32) / np.float32(full)
+    finite = np.isfinite(points).all(axis=1)
+    return points[finite], colours[finite]
