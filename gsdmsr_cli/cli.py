@@ -139,7 +139,8 @@ def evaluate(
     run_folder: RunFolder,
     split: Annotated[Literal["test", "val"], typer.Option(help="Views to compare.")] = "test",
     background: Annotated[
-        Background | None, typer.Option(help="Instead of the one trained with.")
+        Literal["white", "black", "both"] | None,
+        typer.Option(help="Instead of the one trained with."),
     ] = None,
     downscale: Annotated[
         int | None, typer.Option(min=1, help="Instead of the one trained with.")
@@ -147,6 +148,9 @@ def evaluate(
     lpips_weights: Annotated[
         Path | None, typer.Option(metavar="DIR", help="Folder of LPIPS weights.")
     ] = None,
+    lpips_inria: Annotated[
+        bool, typer.Option("--lpips-inria", help="LPIPS on [0, 1] too, as in tables after 3DGS.")
+    ] = False,
     as_json: Json = False,
     fail_under: Annotated[
         list[str] | None,
@@ -155,10 +159,12 @@ def evaluate(
     data: MovedData = None,
 ) -> None:
     """Measure a run on views it has not seen."""
+    from gsdmsr_cli.evaluation.request import Request
+
+    request = Request(split, background, downscale, lpips_weights, lpips_inria)
     from gsdmsr_cli.commands import eval as command
 
-    thresholds = fail_under or []
-    command.run(run_folder, split, background, downscale, lpips_weights, as_json, thresholds, data)
+    command.run(run_folder, request, as_json, fail_under or [], data)
 
 
 @app.command()

@@ -48,6 +48,10 @@ class Pictures:
         self._cache: OrderedDict[_Key, Tensor] = OrderedDict()
         self._lock = threading.Lock()
 
+    def over(self, background: tuple[float, float, float]) -> Pictures:
+        """Return an empty cache of the same pictures over another background."""
+        return Pictures(background, self._downscale, self._limit)
+
     def camera(self, view: View) -> Camera:
         """Return the camera of the picture that ``load`` returns.
 

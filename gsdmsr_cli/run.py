@@ -123,6 +123,20 @@ class Run:
         with self.log_path.open("a", encoding="utf-8") as file:
             file.write(json.dumps(entry, allow_nan=False) + "\n")
 
+    def read_log(self) -> list[dict[str, Any]]:
+        """Return the entries of the log, without a last one that a killed training has cut short.
+
+        Raises:
+            DataError: the log cannot be read or is damaged.
+        """
+        if not self.log_path.is_file():
+            return []
+        try:
+            *lines, _ = self.log_path.read_text(encoding="utf-8").split("\n")
+            return [dict(json.loads(line)) for line in lines]
+        except (OSError, ValueError, TypeError) as error:
+            raise DataError(f"{self.log_path}: cannot be read: {error}") from error
+
     def rewind_log(self, step: int) -> None:
         """Drop the lines of the log after ``step``, and one whose writing was interrupted."""
         if not self.log_path.is_file():

@@ -225,3 +225,12 @@ def test_a_mask_of_another_size_is_refused(tmp_path: Path, views: list[View]) ->
     view = replace(views[0], mask_path=tmp_path / "mask.png")
     with pytest.raises(DataError, match=r"mask\.png is 4 x 4 px, but its camera is 8 x 8"):
         Pictures(WHITE, 1, 1 << 20).counted(view)
+
+
+def test_the_same_pictures_over_another_background(tmp_path: Path) -> None:
+    write_picture(tmp_path / "a.png", np.zeros((SIDE, SIDE, 4), np.uint8))
+    view = make_view(tmp_path / "a.png")
+    white = Pictures(WHITE, 2, BYTES)
+    assert (white.load(view) == 255).all()
+    black = white.over((0.0, 0.0, 0.0))
+    assert (black.load(view) == 0).all() and black.load(view).shape == white.load(view).shape

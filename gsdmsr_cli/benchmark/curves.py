@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from gsdmsr_cli.benchmark.trials import Trial
 from gsdmsr_cli.charts import Line, line_chart
@@ -22,15 +22,14 @@ def charts_of(trials: Sequence[Trial], root: Path) -> dict[str, str]:
     by_scene: dict[str, list[Line]] = {}
     for trial in trials:
         lines = by_scene.setdefault(trial.scene.resolve().name, [])
-        lines.append(Line(trial.name, _curve(open_run(trial.folder(root)).log_path)))
+        lines.append(Line(trial.name, _curve(open_run(trial.folder(root)).read_log())))
     return {
         scene: line_chart(f"{scene}: one held-out view", "minutes of training", "PSNR [dB]", lines)
         for scene, lines in by_scene.items()
     }
 
 
-def _curve(log: Path) -> list[tuple[float, float]]:
+def _curve(log: Sequence[Mapping[str, Any]]) -> list[tuple[float, float]]:
     """Return minutes and PSNR of every report in which it is a number."""
-    entries = [json.loads(line) for line in log.read_text(encoding="utf-8").splitlines()]
-    found = [(e["elapsed"] / 60, e.get("val_psnr", e.get("train_psnr"))) for e in entries]
+    found = [(e["elapsed"] / 60, e.get("val_psnr", e.get("train_psnr"))) for e in log]
     return [(minutes, value) for minutes, value in found if value is not None]

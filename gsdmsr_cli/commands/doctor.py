@@ -16,7 +16,8 @@ from rich.table import Table
 
 from gsdmsr_cli import __version__, plugins, preset_files, raster
 from gsdmsr_cli.errors import GsdmsrError
-from gsdmsr_cli.evaluation.lpips import NETS, Missing, load_lpips
+from gsdmsr_cli.evaluation.lpips import NETS, load_lpips
+from gsdmsr_cli.evaluation.metrics import Missing
 
 _PACKAGES = (
     "torch",

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 
 import torch
@@ -12,6 +11,7 @@ from torch import Tensor, nn
 
 from gsdmsr_cli.errors import DataError, UsageError, nearest
 from gsdmsr_cli.evaluation.lpips_trunks import ARCHITECTURES
+from gsdmsr_cli.evaluation.metrics import Missing
 
 NETS = tuple(ARCHITECTURES)
 """Names of the networks: "alex", "squeeze", "vgg"."""
@@ -23,19 +23,6 @@ FOLDER_VARIABLE = "GSDMSR_LPIPS_DIR"
 _SHIFT = (-0.030, -0.088, -0.188)
 _SCALE = (0.458, 0.448, 0.450)
 _EPSILON = 1e-10
-
-
-@dataclass(frozen=True)
-class Missing:
-    """Why there is no LPIPS value.
-
-    Attributes:
-        reason: one line naming the files that were looked for.
-        searched: the folders looked into, in order.
-    """
-
-    reason: str
-    searched: tuple[str, ...]
 
 
 class Lpips:
@@ -58,14 +45,23 @@ class Lpips:
             DataError: the pictures are smaller than ``smallest`` on a side.
             ValueError: the shapes differ or are not (H, W, 3).
         """
-        pair = [image.permute(2, 0, 1)[None] * 2.0 - 1.0 for image in (rendered, target)]
-        return float(self.distance(*pair))
+        return self.unscaled(rendered * 2.0 - 1.0, target * 2.0 - 1.0)
+
+    def unscaled(self, rendered: Tensor, target: Tensor) -> float:
+        """Return the distance between two (H, W, 3) pictures as they are.
+
+        On [0, 1] this is the variant of the tables of 3DGS and of most papers after it.
+
+        Raises:
+            DataError, ValueError: as the distance itself.
+        """
+        first, second = (image.permute(2, 0, 1)[None] for image in (rendered, target))
+        return float(self.distance(first, second))
 
     @torch.inference_mode()
     def distance(self, first: Tensor, second: Tensor) -> Tensor:
         """Return the distances (B,) between two batches (B, 3, H, W) of pictures in [-1, 1].
 
-        The pictures go through unscaled: feeding [0, 1] gives the variant of many 3DGS tables.
         Per tap, both features are divided by their norm over the channels, and the squared
         differences are weighted, summed over the channels and averaged over the picture.
 

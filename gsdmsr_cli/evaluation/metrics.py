@@ -1,8 +1,9 @@
-"""PSNR and SSIM of one picture, as the papers' tables define them (METHODS.md 0.10)."""
+"""PSNR, SSIM and MS-SSIM of one picture, as the papers' tables define them (METHODS.md 0.10)."""
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import torch
 import torch.nn.functional as F  # noqa: N812
@@ -11,10 +12,27 @@ from torch import Tensor
 PSNR_CAP = 100.0
 """JSON has no infinity: reports write this value [dB] for the PSNR of identical pictures."""
 
+MS_SSIM_SMALLEST = 176
+"""Least width and height [px] at which the fifth scale of MS-SSIM is as large as its window."""
+
+_SCALE_WEIGHTS = (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)
 _WINDOW = 11
 _SIGMA = 1.5
 _C1 = 0.01**2
 _C2 = 0.03**2
+
+
+@dataclass(frozen=True)
+class Missing:
+    """Why a metric has no value.
+
+    Attributes:
+        reason: one line; of files, which were looked for.
+        searched: the folders looked into, in order.
+    """
+
+    reason: str
+    searched: tuple[str, ...]
 
 
 def quantize(image: Tensor) -> Tensor:
@@ -25,56 +43,108 @@ def quantize(image: Tensor) -> Tensor:
     return (image.clamp(0.0, 1.0) * 255.0).round() / 255.0
 
 
-def psnr(rendered: Tensor, target: Tensor) -> float:
+def psnr(rendered: Tensor, target: Tensor, where: Tensor | None = None) -> float:
     """Return -10 log10(mean squared error over all pixels and channels) [dB].
 
-    Identical pictures give inf; NaN in either gives NaN.
+    Identical pictures give inf; NaN in either gives NaN, as does a choice of no pixel.
 
     Args:
         rendered: (H, W, 3) floats in [0, 1].
         target: (H, W, 3) floats in [0, 1].
+        where: (H, W) bools, the pixels that count; all of them if None.
 
     Raises:
         ValueError: the shapes differ or are not (H, W, 3).
     """
     _check_shapes(rendered, target)
-    error = (rendered.detach().double() - target.detach().double()).square().mean().item()
+    squares = (rendered.detach().double() - target.detach().double()).square()
+    error = _mean(squares.mean(dim=2), where)
     return -10.0 * math.log10(error) if error != 0.0 else math.inf
 
 
 @torch.inference_mode()
-def ssim(rendered: Tensor, target: Tensor) -> float:
+def ssim(rendered: Tensor, target: Tensor, where: Tensor | None = None) -> float:
     """Return the mean structural similarity over all pixels and channels, at most 1.
 
     The definition is that of 3DGS: Wang et al. 2004 with an 11 x 11 Gaussian window of sigma
     1.5 px, C1 = 0.01^2, C2 = 0.03^2 and 5 px of zero padding, so that borders count; packages
-    that crop or mirror the border give other values.
+    that crop or mirror the border give other values. With a choice of pixels the mean is over
+    them; the windows around them are as they are without it, so they reach beyond its edge.
 
     Args:
         rendered: (H, W, 3) floats in [0, 1].
         target: (H, W, 3) floats in [0, 1].
+        where: (H, W) bools, the pixels that count; all of them if None.
 
     Raises:
         ValueError: the shapes differ or are not (H, W, 3).
     """
     _check_shapes(rendered, target)
     x, y = rendered.permute(2, 0, 1), target.to(rendered).permute(2, 0, 1)
-    mean_x, mean_y, xx, yy, xy = _blur(torch.stack([x, y, x * x, y * y, x * y]))
+    luminance, contrast = _similarity(x, y, padding=_WINDOW // 2)
+    return _mean((luminance * contrast).mean(dim=0), where)
+
+
+@torch.inference_mode()
+def ms_ssim(rendered: Tensor, target: Tensor) -> float:
+    """Return the structural similarity over five scales, in [0, 1] (Wang et al. 2003).
+
+    Each scale is the one before it, averaged over 2 x 2 pixels. The contrast terms of the first
+    four and the whole similarity of the last are averaged over pixels and channels, raised to the
+    power of their weight and multiplied; a negative mean counts as 0. The window is that of
+    ``ssim``; in the first four scales it stays inside the picture, around the last, of which that
+    would leave little, the picture is mirrored. This is what torchmetrics computes.
+
+    Args:
+        rendered: (H, W, 3) floats in [0, 1].
+        target: (H, W, 3) floats in [0, 1].
+
+    Raises:
+        ValueError: the shapes differ or are not (H, W, 3), or a side is below ``MS_SSIM_SMALLEST``.
+    """
+    _check_shapes(rendered, target)
+    if min(rendered.shape[:2]) < MS_SSIM_SMALLEST:
+        raise ValueError(f"MS-SSIM needs {MS_SSIM_SMALLEST} px a side, not {rendered.shape[:2]}")
+    x, y = rendered.permute(2, 0, 1), target.to(rendered).permute(2, 0, 1)
+    means = []
+    for _ in _SCALE_WEIGHTS[:-1]:
+        _, contrast = _similarity(x, y, padding=0)
+        means.append(float(contrast.mean(dtype=torch.float64)))
+        x, y = F.avg_pool2d(x, 2), F.avg_pool2d(y, 2)
+    x, y = (F.pad(image, 4 * [_WINDOW // 2], mode="reflect") for image in (x, y))
+    luminance, contrast = _similarity(x, y, padding=0)
+    means.append(float((luminance * contrast).mean(dtype=torch.float64)))
+    if any(map(math.isnan, means)):
+        return math.nan
+    factors: list[float] = [
+        max(mean, 0.0) ** weight for mean, weight in zip(means, _SCALE_WEIGHTS, strict=True)
+    ]
+    return math.prod(factors)
+
+
+def _similarity(x: Tensor, y: Tensor, padding: int) -> tuple[Tensor, Tensor]:
+    """Return the luminance and the contrast-structure terms of SSIM of two (C, H, W) pictures."""
+    mean_x, mean_y, xx, yy, xy = _blur(torch.stack([x, y, x * x, y * y, x * y]), padding)
     var_x, var_y, covariance = xx - mean_x**2, yy - mean_y**2, xy - mean_x * mean_y
     luminance = (2 * mean_x * mean_y + _C1) / (mean_x**2 + mean_y**2 + _C1)
-    structure = (2 * covariance + _C2) / (var_x + var_y + _C2)
-    return float((luminance * structure).mean(dtype=torch.float64))
+    return luminance, (2 * covariance + _C2) / (var_x + var_y + _C2)
 
 
-def _blur(maps: Tensor) -> Tensor:
+def _blur(maps: Tensor, padding: int) -> Tensor:
     """Convolve maps (M, C, H, W) with the Gaussian window, one axis at a time, zeros outside."""
     offsets = torch.arange(_WINDOW, dtype=torch.float64) - _WINDOW // 2
     weights = torch.exp(-offsets.square() / (2 * _SIGMA**2))
     kernel = (weights / weights.sum()).to(maps)
     flat = maps.reshape(-1, 1, *maps.shape[-2:])
-    flat = F.conv2d(flat, kernel.view(1, 1, 1, -1), padding=(0, _WINDOW // 2))
-    flat = F.conv2d(flat, kernel.view(1, 1, -1, 1), padding=(_WINDOW // 2, 0))
-    return flat.reshape(maps.shape)
+    flat = F.conv2d(flat, kernel.view(1, 1, 1, -1), padding=(0, padding))
+    flat = F.conv2d(flat, kernel.view(1, 1, -1, 1), padding=(padding, 0))
+    return flat.reshape(*maps.shape[:2], *flat.shape[-2:])
+
+
+def _mean(values: Tensor, where: Tensor | None) -> float:
+    """Return the mean of (H, W) values over the chosen pixels, NaN if there are none."""
+    chosen = values if where is None else values[where]
+    return float(chosen.mean(dtype=torch.float64))
 
 
 def _check_shapes(rendered: Tensor, target: Tensor) -> None:

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from statistics import fmean
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from gsdmsr_cli.evaluation.lpips import NETS, Lpips, Missing, load_lpips
-from gsdmsr_cli.evaluation.metrics import PSNR_CAP, psnr, quantize, ssim
+from gsdmsr_cli.evaluation.catalogue import Metric
+from gsdmsr_cli.evaluation.metrics import PSNR_CAP, Missing, psnr, quantize, ssim
 from gsdmsr_cli.model import MOVED_BY, STORED_AS, Model
 from gsdmsr_cli.pictures import Pictures
 from gsdmsr_cli.raster import Engine
@@ -23,7 +23,9 @@ CONVENTIONS = {
     "renders": "clamped to [0, 1] and rounded to 8 bits; psnr_float is of unrounded ones",
     "psnr": f"of the mean squared error over all pixels and channels, at most {PSNR_CAP:g} dB",
     "ssim": "11 x 11 Gaussian window of sigma 1.5 px, zero padding, mean over all pixels",
-    "lpips": "v0.1, pictures mapped to [-1, 1]",
+    "ms_ssim": "five scales with that window, only the last padded (mirrored), as in torchmetrics",
+    "lpips": "v0.1, pictures mapped to [-1, 1]; those named _inria on [0, 1]",
+    "parts": "psnr and ssim of the pixels that masks choose, over frames that have such pixels",
     "aggregate": "mean over frames",
 }
 """What the numbers mean, as written into every report."""
@@ -62,29 +64,32 @@ class Studio:
         """
         return self.pictures.load(view).permute(1, 2, 0).float() / 255
 
+    def over(self, background: tuple[float, float, float]) -> Studio:
+        """Return the studio with another background, behind drawn and true pictures alike."""
+        pictures, colour = self.pictures.over(background), self.background.new_tensor(background)
+        return replace(self, pictures=pictures, background=colour)
 
-def load_nets(size: tuple[int, int], **where: Any) -> dict[str, Lpips | Missing]:
-    """Load LPIPS on every network, or the reason why there is none for pictures of this size.
+    def parts(self, view: View) -> dict[str, Tensor]:
+        """Return the parts of the view's picture that it has masks for, (H, W) bools each.
 
-    Args:
-        size: width and height of the pictures [px].
-        where: passed on to ``load_lpips``.
-    """
-    nets = {f"lpips_{net}": load_lpips(net, **where) for net in NETS}
-    return {name: _fit(net, size) for name, net in nets.items()}
+        "masked" are the pixels that count, "moving" and "static" those of them where the scene
+        moves and where it does not.
 
-
-def _fit(net: Lpips | Missing, size: tuple[int, int]) -> Lpips | Missing:
-    if isinstance(net, Missing) or min(size) >= net.smallest:
-        return net
-    reason = f"pictures of {size[0]} x {size[1]} px; '{net.net}' needs {net.smallest} px a side"
-    return Missing(reason, ())
+        Raises:
+            DataError: a mask cannot be read.
+        """
+        counted, moving = self.pictures.counted(view), self.pictures.moving(view)
+        parts = {} if counted is None else {"masked": counted}
+        if moving is not None:
+            within = torch.ones_like(moving) if counted is None else counted
+            parts |= {"moving": within & moving, "static": within & ~moving}
+        return parts
 
 
 def score_views(
     studio: Studio,
     views: Iterable[View],
-    nets: Mapping[str, Lpips | Missing],
+    metrics: Mapping[str, Metric | Missing],
     tell: Callable[[int], None],
 ) -> list[tuple[View, Scores]]:
     """Return the scores of every view; ``tell`` is called with how many are done.
@@ -94,21 +99,39 @@ def score_views(
     """
     scored = []
     for done, view in enumerate(views, start=1):
-        scored.append((view, score(studio.draw(view), studio.true(view), nets)))
+        drawn, true, parts = studio.draw(view), studio.true(view), studio.parts(view)
+        scored.append((view, score(drawn, true, metrics, parts)))
         tell(done)
     return scored
 
 
-def score(drawn: Tensor, true: Tensor, nets: Mapping[str, Lpips | Missing]) -> Scores:
-    """Return all metrics of one picture (H, W, 3) against the true one."""
+def score(
+    drawn: Tensor,
+    true: Tensor,
+    metrics: Mapping[str, Metric | Missing],
+    parts: Mapping[str, Tensor] | None = None,
+) -> Scores:
+    """Return all metrics of one picture (H, W, 3) against the true one.
+
+    Args:
+        drawn: the picture, unclamped.
+        true: the true one, in [0, 1].
+        metrics: which to compute beside PSNR and SSIM.
+        parts: (H, W) bools by their names, whose PSNR and SSIM are wanted too; those without a
+            pixel are left out.
+    """
     rounded = quantize(drawn)
     values: dict[str, float] = {
         "psnr": psnr(rounded, true),
         "psnr_float": psnr(drawn.clamp(0, 1), true),
         "ssim": ssim(rounded, true),
     }
-    for name, net in nets.items():
-        values[name] = math.nan if isinstance(net, Missing) else net(rounded, true)
+    for name, metric in metrics.items():
+        values[name] = math.nan if isinstance(metric, Missing) else metric(rounded, true)
+    for part, where in (parts or {}).items():
+        if where.any():
+            values[f"psnr_{part}"] = psnr(rounded, true, where)
+            values[f"ssim_{part}"] = ssim(rounded, true, where)
     return {name: _finite(value) for name, value in values.items()}
 
 
@@ -118,9 +141,9 @@ def _finite(value: float) -> float | None:
 
 
 def average(scores: Sequence[Scores]) -> Scores:
-    """Return the mean of every metric, None if any frame lacks it."""
-    columns = {name: [frame[name] for frame in scores] for name in scores[0]}
-    return {name: _mean(values) for name, values in columns.items()}
+    """Return the mean of every metric over the frames that name it, None if any has no number."""
+    names = dict.fromkeys(name for frame in scores for name in frame)
+    return {name: _mean([frame[name] for frame in scores if name in frame]) for name in names}
 
 
 def _mean(values: Sequence[float | None]) -> float | None:
@@ -128,16 +151,23 @@ def _mean(values: Sequence[float | None]) -> float | None:
     return fmean(numbers) if len(numbers) == len(values) else None
 
 
-def with_reasons(aggregate: Scores, nets: Mapping[str, Lpips | Missing]) -> dict[str, Any]:
-    """Return the aggregate for a report: every LPIPS with the reason where it has no value."""
-    return aggregate | {name: _explained(aggregate[name], net) for name, net in nets.items()}
+def with_reasons(aggregate: Scores, metrics: Mapping[str, Metric | Missing]) -> dict[str, Any]:
+    """Return the aggregate for a report, with the reason where such a metric has no value."""
+    return aggregate | {name: _explained(aggregate[name], m) for name, m in metrics.items()}
 
 
-def _explained(value: float | None, net: Lpips | Missing) -> dict[str, Any]:
-    if isinstance(net, Missing):
-        return {"value": None, "reason": net.reason, "searched": list(net.searched)}
+def _explained(value: float | None, metric: Metric | Missing) -> dict[str, Any]:
+    if isinstance(metric, Missing):
+        return {"value": None, "reason": metric.reason, "searched": list(metric.searched)}
     reason = None if value is not None else "not a number in at least one frame"
     return {"value": value, "reason": reason, "searched": []}
+
+
+def value_of(aggregate: Mapping[str, Any], metric: str) -> float | None:
+    """Return the number that a report's aggregate has for a metric, or None."""
+    entry = aggregate.get(metric)
+    value: float | None = entry["value"] if isinstance(entry, Mapping) else entry
+    return value
 
 
 def storage(tensors: Mapping[str, Tensor]) -> dict[str, int]:

@@ -6,7 +6,7 @@ import math
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from types import FrameType
@@ -42,6 +42,7 @@ class Report:
         ms_per_step: mean wall time since the last report [ms].
         psnr: of the watched view, rounded to 8 bits [dB], or None if it is not a number.
         split: which split the watched view belongs to, "val" or, in scenes without, "train".
+        stages: seconds since the last report by what they went into, see ``training.stages``.
     """
 
     step: int
@@ -54,6 +55,7 @@ class Report:
     ms_per_step: float
     psnr: float | None
     split: str
+    stages: Mapping[str, float]
 
     @property
     def remaining(self) -> float:
@@ -72,6 +74,7 @@ class Report:
             "still": round(self.still, 4),
             "ms_per_step": round(self.ms_per_step, 3),
             f"{self.split}_psnr": self.psnr,
+            "stages": {stage: round(seconds, 4) for stage, seconds in self.stages.items()},
         }
 
 
@@ -96,7 +99,8 @@ def train(trainer: Trainer, run: Run, tell: Callable[[Report], None]) -> bool:
             if watch.is_due():
                 _tell(watch.report(), run, tell)
             if time.perf_counter() - saved >= interval:
-                run.save(trainer.checkpoint())
+                with trainer.stopwatch.of("save"):
+                    run.save(trainer.checkpoint())
                 saved = time.perf_counter()
         if watch.losses:
             _tell(watch.report(), run, tell)
@@ -157,6 +161,7 @@ class _Watch:
             ms_per_step=1000 * (clock.elapsed - self.elapsed) / len(self.losses),
             psnr=self._psnr(),
             split=self.view.split,
+            stages=self.trainer.stopwatch.take(),
         )
         self.begin()
         return report
@@ -165,7 +170,8 @@ class _Watch:
         observer = self.trainer.observer
         model, background = self.trainer.result(), observer.background
         studio = Studio(model, observer.engine, observer.pictures, background)
-        value = psnr(quantize(studio.draw(self.view)), studio.true(self.view))
+        with self.trainer.stopwatch.of("watch"):
+            value = psnr(quantize(studio.draw(self.view)), studio.true(self.view))
         return None if math.isnan(value) else min(value, PSNR_CAP)
 
 

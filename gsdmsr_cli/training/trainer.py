@@ -26,6 +26,7 @@ from gsdmsr_cli.training.look import Look, Observer, Stage
 from gsdmsr_cli.training.optimizer import Adam, Gate
 from gsdmsr_cli.training.saliency import Saliency, step_saliency
 from gsdmsr_cli.training.schedule import log_linear, new_clock
+from gsdmsr_cli.training.stages import Stopwatch
 from gsdmsr_cli.training.state import Part, below, gather, scatter
 from gsdmsr_cli.training.stillness import motion_saliency
 from gsdmsr_cli.training.team import Team
@@ -58,6 +59,7 @@ class Trainer:
         clock: steps, time and progress.
         observer: how views are looked at.
         team: who looks at them; this process alone until ``hire``.
+        stopwatch: what the time goes into.
     """
 
     def __init__(self, scene: Scene, preset: Preset, engine: Engine, pictures: Pictures) -> None:
@@ -78,6 +80,7 @@ class Trainer:
         self.tiles = TileSampler(preset.training.tiles_per_view)
         self.average = averaging.Average()
         self.clock = new_clock(preset.training)
+        self.stopwatch = Stopwatch()
         self._queue: list[int] = []
         self._rounds = self._resets = 0
         self._moving = False
@@ -105,10 +108,11 @@ class Trainer:
         stage = Stage(progress, self._moving, teachers)
         tile_weights = [self._choose_tiles(row, progress) for row in rows]
         penalised = self._moving and self.clock.step % PENALTY_EVERY == 0
-        looks, penalty = self.team.look(
-            self.model, rows, stage, tile_weights,
-            lambda: self._penalise(tensors, self.views[rows[0]]) if penalised else None,
-        )  # fmt: skip
+        with self.stopwatch.of("look"):
+            looks, penalty = self.team.look(
+                self.model, rows, stage, tile_weights,
+                lambda: self._penalise(tensors, self.views[rows[0]]) if penalised else None,
+            )  # fmt: skip
         value = fmean(look.loss for look in looks)
         gradients = [look.gradients for look in looks]
         if penalty is not None:
@@ -127,9 +131,11 @@ class Trainer:
         if progress < self.preset.density.until:
             for look in looks:
                 self.statistics.observe(look.on_screen, *look.size)
-        self._learn(tensors, progress, looks if gated else None)
-        self._control_density(progress)
-        self._settle(progress)
+        with self.stopwatch.of("learn"):
+            self._learn(tensors, progress, looks if gated else None)
+        with self.stopwatch.of("grow"):
+            self._control_density(progress)
+            self._settle(progress)
         if self.clock.step % averaging.EVERY == 0:
             self._average(progress)
         return Step(value)

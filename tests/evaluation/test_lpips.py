@@ -12,8 +12,9 @@ import torch.nn.functional as F  # noqa: N812
 from torch import Tensor
 
 from gsdmsr_cli.errors import DataError, UsageError
-from gsdmsr_cli.evaluation.lpips import NETS, Lpips, Missing, load_lpips
+from gsdmsr_cli.evaluation.lpips import NETS, Lpips, load_lpips
 from gsdmsr_cli.evaluation.lpips_trunks import ARCHITECTURES
+from gsdmsr_cli.evaluation.metrics import Missing
 
 Weights = dict[str, Tensor]
 

@@ -1,4 +1,4 @@
-"""PSNR against its closed form; SSIM against scikit-image and a loop over windows."""
+"""PSNR against its closed form; SSIM and MS-SSIM against other libraries and a plain loop."""
 
 from __future__ import annotations
 
@@ -11,8 +11,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from skimage.metrics import structural_similarity
 from torch import Tensor
+from torchmetrics.functional.image import multiscale_structural_similarity_index_measure
 
-from gsdmsr_cli.evaluation.metrics import psnr, quantize, ssim
+from gsdmsr_cli.evaluation.metrics import MS_SSIM_SMALLEST, ms_ssim, psnr, quantize, ssim
 
 
 def pair(height: int, width: int, seed: int = 0) -> tuple[Tensor, Tensor]:
@@ -101,7 +102,91 @@ def test_metrics_accept_pictures_that_carry_gradients() -> None:
     assert math.isfinite(ssim(x, y))
 
 
-@pytest.mark.parametrize("metric", [psnr, ssim])
+def smooth_pair(height: int, width: int, noise: float) -> tuple[Tensor, Tensor]:
+    """Return a picture with structure at every scale, and a noisy copy."""
+    rows, columns = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
+    waves = [torch.sin(rows / p + channel) * torch.cos(columns / p)
+             for channel in range(3) for p in (2.0, 9.0, 40.0)]  # fmt: skip
+    x = 0.5 + torch.stack([sum(waves[3 * c : 3 * c + 3]) / 7 for c in range(3)], dim=-1)
+    y = x + noise * torch.randn(x.shape, generator=torch.Generator().manual_seed(5))
+    return x.clamp(0, 1), y.clamp(0, 1)
+
+
+def torchmetrics_ms_ssim(x: Tensor, y: Tensor) -> float:
+    batches = (image.permute(2, 0, 1)[None] for image in (x, y))
+    return multiscale_structural_similarity_index_measure(*batches, data_range=1.0).item()
+
+
+@pytest.mark.parametrize(("height", "width"), [(176, 176), (191, 240), (256, 177)])
+@pytest.mark.parametrize("noise", [0.02, 0.3])
+def test_ms_ssim_equals_torchmetrics(height: int, width: int, noise: float) -> None:
+    x, y = smooth_pair(height, width, noise)
+    expected = torchmetrics_ms_ssim(x.double(), y.double())
+    assert 0.2 < expected < 0.999
+    # its exponents are rounded to float32, by 3e-8 of their size, and ln of a mean is below 10
+    assert ms_ssim(x.double(), y.double()) == pytest.approx(expected, abs=3e-7)
+    assert ms_ssim(x, y) == pytest.approx(expected, abs=1e-5)
+
+
+def test_ms_ssim_of_identical_pictures_is_one_and_of_opposite_ones_zero() -> None:
+    x, _ = smooth_pair(180, 180, 0.0)
+    assert ms_ssim(x, x) == pytest.approx(1.0, abs=1e-6)
+    assert ms_ssim(1 - x, x) == 0.0  # its contrast terms are negative
+
+
+def test_ms_ssim_needs_room_for_five_scales_and_numbers() -> None:
+    x, y = smooth_pair(MS_SSIM_SMALLEST, MS_SSIM_SMALLEST, 0.1)
+    with pytest.raises(ValueError, match="176"):
+        ms_ssim(x[1:], y[1:])
+    y[80, 90, 1] = math.nan
+    assert math.isnan(ms_ssim(x, y))
+
+
+def chosen(height: int, width: int) -> Tensor:
+    """Return a choice of some pixels."""
+    return torch.rand(height, width, generator=torch.Generator().manual_seed(3)) < 0.3
+
+
+def test_psnr_of_a_choice_is_that_of_its_pixels_alone() -> None:
+    x, y = pair(13, 17)
+    where = chosen(13, 17)
+    alone = psnr(x[where][None], y[where][None])  # a picture of one row
+    assert psnr(x, y, where) == pytest.approx(alone, abs=1e-9)
+    spoilt = torch.where(where[..., None], x, torch.rand(13, 17, 3))
+    assert psnr(spoilt, y, where) == psnr(x, y, where)
+
+
+def test_psnr_of_a_part_and_of_the_rest_make_up_that_of_the_whole() -> None:
+    x, y = pair(13, 17)
+    where = chosen(13, 17)
+    share = where.double().mean().item()
+    errors = [10 ** (-psnr(x, y, part) / 10) for part in (where, ~where)]
+    whole = share * errors[0] + (1 - share) * errors[1]
+    assert psnr(x, y) == pytest.approx(-10 * math.log10(whole), abs=1e-9)
+
+
+def test_ssim_of_a_choice_is_the_mean_of_its_windows() -> None:
+    x, y = pair(14, 12)
+    where = torch.zeros(14, 12, dtype=torch.bool)
+    where[7, 5] = True
+    window = (slice(2, 13), slice(0, 11))  # of the pixel (7, 5), all inside
+    # zero padding of the 11 x 11 cut does not reach the window of its middle
+    middle = torch.zeros(11, 11, dtype=torch.bool)
+    middle[5, 5] = True
+    assert ssim(x, y, where) == pytest.approx(ssim(x[window], y[window], middle), abs=1e-6)
+    parts = chosen(14, 12)
+    share = parts.double().mean().item()
+    whole = share * ssim(x, y, parts) + (1 - share) * ssim(x, y, ~parts)
+    assert ssim(x, y) == pytest.approx(whole, abs=1e-6)
+
+
+def test_of_no_pixel_there_is_no_number() -> None:
+    x, y = pair(12, 12)
+    nowhere = torch.zeros(12, 12, dtype=torch.bool)
+    assert math.isnan(psnr(x, y, nowhere)) and math.isnan(ssim(x, y, nowhere))
+
+
+@pytest.mark.parametrize("metric", [psnr, ssim, ms_ssim])
 def test_shapes_that_would_broadcast_are_refused(metric) -> None:
     with pytest.raises(ValueError, match=r"\(8, 9, 3\) and \(1, 9, 3\)"):
         metric(torch.zeros(8, 9, 3), torch.zeros(1, 9, 3))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,8 +16,15 @@ from torch import Tensor
 from gsdmsr_cli.camera import Camera
 from gsdmsr_cli.errors import DataError
 from gsdmsr_cli.evaluation import protocol
-from gsdmsr_cli.evaluation.lpips import NETS, Lpips, Missing
-from gsdmsr_cli.evaluation.protocol import Studio, average, load_nets, score, score_views, storage
+from gsdmsr_cli.evaluation.metrics import Missing, psnr, quantize, ssim
+from gsdmsr_cli.evaluation.protocol import (
+    Studio,
+    average,
+    score,
+    score_views,
+    storage,
+    value_of,
+)
 from gsdmsr_cli.fields.planes import CUBE
 from gsdmsr_cli.model import Model
 from gsdmsr_cli.motion import Facts, start_motion
@@ -75,6 +83,37 @@ def test_averages_are_means_over_frames_and_none_where_a_frame_has_none() -> Non
     assert average(frames) == {"psnr": 27.0, "ssim": None}
 
 
+def test_frames_that_do_not_name_a_metric_do_not_count_for_it() -> None:
+    """A frame in which nothing moves says nothing of how well motion is met."""
+    frames = [{"psnr": 20.0}, {"psnr": 30.0, "psnr_moving": 12.0}]
+    assert average(frames) == {"psnr": 25.0, "psnr_moving": 12.0}
+
+
+def test_the_number_of_a_metric_is_found_in_every_form() -> None:
+    aggregate = {"psnr": 20.0, "ssim": None, "lpips_alex": {"value": 0.5, "reason": None}}
+    found = [value_of(aggregate, metric) for metric in ("psnr", "ssim", "lpips_alex", "ms_ssim")]
+    assert found == [20.0, None, 0.5, None]
+
+
+def test_parts_of_a_picture_are_scored_and_empty_ones_left_out() -> None:
+    drawn, true = (
+        torch.rand(12, 14, 3, generator=torch.Generator().manual_seed(s)) for s in (1, 2)
+    )
+    left = torch.zeros(12, 14, dtype=torch.bool)
+    left[:, :5] = True
+    scores = score(drawn, true, {}, {"moving": left, "static": ~left, "masked": left & ~left})
+    assert scores.keys() == {
+        "psnr", "psnr_float", "ssim", "psnr_moving", "ssim_moving", "psnr_static", "ssim_static",
+    }  # fmt: skip
+    rounded = quantize(drawn)
+    assert scores["psnr_moving"] == pytest.approx(psnr(rounded[:, :5], true[:, :5]), abs=1e-9)
+    assert scores["psnr_static"] == pytest.approx(psnr(rounded[:, 5:], true[:, 5:]), abs=1e-9)
+    assert scores["ssim_moving"] == ssim(rounded, true, left)
+    drawn[3, 2] = math.nan
+    scores = score(drawn, true, {}, {"moving": left, "static": ~left})
+    assert scores["psnr_moving"] is None and scores["psnr_static"] is not None
+
+
 def test_every_missing_value_has_its_reason() -> None:
     nets = {"lpips_alex": None, "lpips_vgg": Missing("no weights", ("a", "b")), "lpips_x": None}
     aggregate = {"psnr": 20.0, "lpips_alex": 0.5, "lpips_vgg": None, "lpips_x": None}
@@ -86,28 +125,6 @@ def test_every_missing_value_has_its_reason() -> None:
         "lpips_x": {"value": None, "reason": "not a number in at least one frame", "searched": []},
     }
     json.dumps(found, allow_nan=False)
-
-
-def test_nets_without_weights_say_where_they_were_looked_for(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.delenv("GSDMSR_LPIPS_DIR", raising=False)
-    monkeypatch.setenv("TORCH_HOME", str(tmp_path))
-    nets = load_nets((64, 64))
-    assert nets.keys() == {f"lpips_{net}" for net in NETS}
-    for net in nets.values():
-        assert isinstance(net, Missing) and net.reason and net.searched
-
-
-def test_pictures_too_small_for_a_net_are_a_reason(shared_data: Path) -> None:
-    folder = shared_data / "lpips"
-    large, small = (load_nets((side, 200), folder=folder) for side in (200, 8))
-    found = {name for name, net in large.items() if isinstance(net, Lpips)}
-    if not found:
-        pytest.skip(f"{folder} holds no LPIPS weights")
-    for name in found:
-        net = small[name]
-        assert isinstance(net, Missing) and "pictures of 8 x 200 px" in net.reason
 
 
 @pytest.fixture
@@ -144,6 +161,40 @@ def test_a_studio_draws_and_loads_at_the_size_of_its_pictures(
     torch.testing.assert_close(true, torch.full((8, 10, 3), 0.2))
     expected = 0.5 * 0.5 + 0.5 * torch.tensor(BACKGROUND)  # half opaque, half grey
     torch.testing.assert_close(drawn, expected.expand(8, 10, 3), atol=5e-3, rtol=0)
+
+
+def write_mask(path: Path, white: tuple[slice, slice]) -> Path:
+    pixels = np.zeros((16, 20, 1), np.uint8)
+    pixels[white] = 255
+    write_picture(path, pixels)
+    return path
+
+
+def test_what_moves_is_a_part_of_what_counts(studio: Studio, tmp_path: Path) -> None:
+    view = view_of(tmp_path, "a")
+    assert studio.parts(view) == {}
+    left, above = (slice(None), slice(0, 10)), (slice(0, 4), slice(None))
+    view = replace(view, moving_path=write_mask(tmp_path / "moves.png", left))
+    rows, columns = torch.meshgrid(torch.arange(8), torch.arange(10), indexing="ij")
+    parts = studio.parts(view)
+    assert parts.keys() == {"moving", "static"}
+    assert torch.equal(parts["moving"], columns < 5)
+    assert torch.equal(parts["static"], columns >= 5)
+    parts = studio.parts(replace(view, mask_path=write_mask(tmp_path / "counts.png", above)))
+    assert torch.equal(parts["masked"], rows < 2)
+    assert torch.equal(parts["moving"], (rows < 2) & (columns < 5))
+    assert torch.equal(parts["static"], (rows < 2) & (columns >= 5))
+
+
+def test_another_background_lies_behind_drawn_and_true_pictures(
+    studio: Studio, tmp_path: Path
+) -> None:
+    write_picture(tmp_path / "a.png", np.full((16, 20, 4), (255, 255, 255, 51), np.uint8))
+    view, black = view_of(tmp_path, "a"), studio.over((0.0, 0.0, 0.0))
+    drawn = torch.full((8, 10, 3), 0.25)
+    torch.testing.assert_close(black.draw(view), drawn, atol=5e-3, rtol=0)
+    torch.testing.assert_close(black.true(view), torch.full((8, 10, 3), 0.2))
+    assert studio.true(view)[0, 0, 2] == pytest.approx(0.2 + 0.8 * 0.6, abs=0.5 / 255)
 
 
 def test_views_are_scored_in_order_and_told(studio: Studio, tmp_path: Path) -> None:

@@ -255,7 +255,7 @@ def test_an_error_leaves_the_last_checkpoint(
 
 
 def test_time_left_follows_from_the_pace() -> None:
-    report = Report(10, 30.0, 0.25, 0.1, 5, 1.0, 0.0, 3.0, 20.0, "val")
+    report = Report(10, 30.0, 0.25, 0.1, 5, 1.0, 0.0, 3.0, 20.0, "val", {})
     assert report.remaining == pytest.approx(90.0)
     assert math.isfinite(replace(report, progress=0.0).remaining)
     assert replace(report, progress=1.0).remaining == 0

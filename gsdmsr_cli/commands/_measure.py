@@ -1,0 +1,161 @@
+"""What eval measures of a run, as the document that it writes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from gsdmsr_cli import machine
+from gsdmsr_cli.commands._progress import part_of, progress_bar
+from gsdmsr_cli.commands._trained import Trained
+from gsdmsr_cli.evaluation import protocol
+from gsdmsr_cli.evaluation.catalogue import PARTS, Metric, load_metrics
+from gsdmsr_cli.evaluation.metrics import Missing
+from gsdmsr_cli.evaluation.request import BOTH, Request
+from gsdmsr_cli.evaluation.speed import measure_speed
+from gsdmsr_cli.files import read_json
+from gsdmsr_cli.preset import BACKGROUNDS
+from gsdmsr_cli.scene import SPLITS, View
+
+SCHEMA = 1
+
+OTHER_VIEWS = 20
+"""Views of every other split, evenly spaced, whose PSNR is reported beside that of the split."""
+
+Scored = Sequence[tuple[View, protocol.Scores]]
+
+_Sitting = tuple[str, protocol.Studio, Sequence[View], Mapping[str, Metric | Missing]]
+"""What is scored in one go: a split or background, and the views and metrics wanted of it."""
+
+
+def measure(trained: Trained, request: Request) -> dict[str, Any]:
+    """Return the document of ``metrics.json``.
+
+    Raises:
+        DataError: the split has no views, or pictures, masks or weights cannot be read.
+        UsageError: the pictures are too small for the downscale.
+    """
+    views, studio = trained.scene.split(request.split), trained.studio
+    cameras = [studio.pictures.camera(view) for view in views]
+    sizes = [(camera.width, camera.height) for camera in cameras]
+    metrics = load_metrics(min(sizes, key=min), request.lpips_weights, request.lpips_inria)
+    first, *others = _backgrounds(trained, request)
+    chosen = _views_by_split(trained, request.split)
+    work: list[_Sitting] = [
+        (split, studio, own, metrics if split == request.split else {})
+        for split, own in chosen.items()
+    ]
+    work += [(name, studio.over(BACKGROUNDS[name]), views, metrics) for name in others]
+    scored = _score_all(work)
+    shots = list(zip(cameras, (view.time for view in views), strict=True))
+    speed = measure_speed(studio.model, shots, studio.engine, studio.background)
+    return {
+        "schema": SCHEMA,
+        "protocol": _protocol(trained, request, first, sizes[0]),
+        **_results(scored[request.split], metrics),
+        "splits": {
+            split: {"psnr": _mean(scored[split])["psnr"], "frames": len(own)}
+            for split, own in chosen.items()
+        },
+        "backgrounds": {name: _results(scored[name], metrics) for name in others},
+        "speed": speed.document(),
+        "storage": {
+            "checkpoint_bytes": trained.run.checkpoint_path.stat().st_size,
+            **protocol.storage(trained.checkpoint.tensors),
+        },
+        "training": _training(trained),
+    }
+
+
+def _score_all(work: Sequence[_Sitting]) -> dict[str, Scored]:
+    """Return the scores of every sitting by its name."""
+    total = sum(len(views) for _, _, views, _ in work)
+    scored: dict[str, Scored] = {}
+    with progress_bar("comparing pictures") as tell:
+        for name, studio, views, metrics in work:
+            told = part_of(tell, sum(map(len, scored.values())), total)
+            scored[name] = protocol.score_views(studio, views, metrics, told)
+    return scored
+
+
+def _backgrounds(trained: Trained, request: Request) -> list[str]:
+    own = trained.run.preset.data.background
+    if request.background == BOTH:
+        return [own, *(name for name in BACKGROUNDS if name != own)]
+    return [request.background or own]
+
+
+def _views_by_split(trained: Trained, split: str) -> dict[str, Sequence[View]]:
+    """Return all views of one split, first, and some of every other there is."""
+    chosen: dict[str, Sequence[View]] = {split: trained.scene.split(split)}
+    for other in SPLITS:
+        views = [view for view in trained.scene.views if view.split == other]
+        if views and other != split:
+            chosen[other] = _evenly(views, OTHER_VIEWS)
+    return chosen
+
+
+def _evenly(views: Sequence[View], count: int) -> list[View]:
+    """Return ``count`` of the views, or all if there are fewer."""
+    count = min(count, len(views))
+    return [views[i * len(views) // count] for i in range(count)]
+
+
+def _protocol(
+    trained: Trained, request: Request, background: str, resolution: tuple[int, int]
+) -> dict[str, Any]:
+    options, checkpoint = trained.run.preset, trained.checkpoint
+    return {
+        "split": request.split,
+        "resolution": list(resolution),
+        "downscale": request.downscale or options.data.downscale,
+        "background": background,
+        "checkpoint": "last",
+        "checkpoint_step": checkpoint.step,
+        "progress": checkpoint.progress,
+        "device": trained.device,
+        "processor": machine.cpu_name(),
+        "preset": trained.run.name,
+        "motion": options.motion["name"],
+        "seed": options.training.seed,
+        "data_fingerprint": trained.run.fingerprint,
+        "conventions": protocol.CONVENTIONS,
+        "versions": machine.versions(),
+    }
+
+
+def _results(scored: Scored, metrics: Mapping[str, Metric | Missing]) -> dict[str, Any]:
+    """Return what has come out over one background: the aggregate and every frame."""
+    counts = {part: sum(f"psnr_{part}" in scores for _, scores in scored) for part in PARTS}
+    return {
+        "aggregate": protocol.with_reasons(_mean(scored), metrics),
+        "parts": {part: {"frames": count} for part, count in counts.items() if count},
+        "frames": [{"name": view.name, "time": view.time, **scores} for view, scores in scored],
+    }
+
+
+def _mean(scored: Scored) -> protocol.Scores:
+    return protocol.average([scores for _, scores in scored])
+
+
+def _training(trained: Trained) -> dict[str, Any]:
+    """Return how the training went; one that was killed has left no account, but a log."""
+    path, checkpoint = trained.run.training_path, trained.checkpoint
+    said = read_json(path) if path.is_file() else {}
+    splats = len(trained.studio.model.splats)
+    known = {"steps": checkpoint.step, "train_s": checkpoint.elapsed, "splats": splats}
+    account = known | (said if said.get("steps") == checkpoint.step else {})
+    return account | {"stages_s": _stages(trained, account["train_s"])}
+
+
+def _stages(trained: Trained, total: float) -> dict[str, float]:
+    """Return the seconds that each stage of the training took, by the log; the rest is "other"."""
+    seconds: dict[str, float] = {}
+    for entry in trained.run.read_log():
+        if entry["step"] <= trained.checkpoint.step:
+            for stage, spent in entry.get("stages", {}).items():
+                seconds[stage] = seconds.get(stage, 0.0) + spent
+    if not seconds:
+        return {}
+    rest = max(total - sum(seconds.values()), 0.0)
+    return {stage: round(spent, 3) for stage, spent in (seconds | {"other": rest}).items()}
