@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
+import cuda_shim
 import pytest
 
 from gsdmsr_cli.synthetic import write_scene
@@ -28,3 +30,18 @@ def tiny_scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("data") / "tiny"
     write_scene(folder, size=48, train=12, val=3, test=4)
     return folder
+
+
+@pytest.fixture(scope="session")
+def _shim_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder of the CUDA kernels that have been built for the CPU in this session."""
+    return tmp_path_factory.mktemp("shim")
+
+
+@pytest.fixture(scope="module")
+def kernels_on_the_cpu(_shim_folder: Path) -> Iterator[None]:
+    """Let CUDA kernels run on tensors in the memory of the CPU."""
+    if cuda_shim.MISSING:
+        pytest.skip(cuda_shim.MISSING)
+    with cuda_shim.on_the_cpu(_shim_folder):
+        yield

@@ -30,7 +30,7 @@ from torch import Tensor
 
 from gsdmsr_cli import plugins
 from gsdmsr_cli.camera import Camera
-from gsdmsr_cli.errors import UsageError
+from gsdmsr_cli.errors import DataError, UsageError
 from gsdmsr_cli.frame import Frame
 from gsdmsr_cli.splats import Splats
 
@@ -118,17 +118,13 @@ def best_engine(device: str) -> Engine:
 
 
 def pick_device(wanted: str) -> str:
-    """Return where to compute, "cpu" or "cuda"; "auto" takes a CUDA engine if one can draw.
+    """Return where commands compute: on the CPU, in this version.
 
     Raises:
-        UsageError: "cuda" is wanted and no CUDA engine can draw.
+        DataError: "cuda" is wanted.
     """
-    if wanted == "cpu":
-        return wanted
-    if "cuda" not in engine_names():
-        reason: str | None = "this version has no CUDA engine"
-    else:
-        reason = load_engine("cuda").unavailable("cuda")
-    if reason is not None and wanted == "cuda":
-        raise UsageError(f"--device cuda: {reason}; use --device cpu")
-    return "cpu" if reason is not None else "cuda"
+    if wanted == "cuda":
+        missing = load_engine("cuda").unavailable("cuda")
+        reason = missing or "commands draw with the CPU engine in this version"
+        raise DataError(f"--device cuda: {reason}; use --device cpu")
+    return "cpu"

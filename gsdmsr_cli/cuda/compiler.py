@@ -1,0 +1,98 @@
+"""From a source of this folder to machine code for one architecture, kept on disk."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import math
+import os
+from functools import cache
+from pathlib import Path
+
+from gsdmsr_cli import splatting_constants as constants
+from gsdmsr_cli.cuda.nvrtc import Nvrtc
+from gsdmsr_cli.errors import GsdmsrError
+from gsdmsr_cli.files import replacing
+
+HERE = Path(__file__).parent
+MOST_VIEWS = 16
+"""Views that one launch can draw: cameras are passed by value, as part of a kernel's arguments."""
+
+OLDEST = 75
+"""The oldest architecture that is compiled for and tested, sm_75 (Turing)."""
+
+_OPTIONS = ("--std=c++17", "--ftz=true")
+_CONSTANTS = (
+    "NEAR", "DILATION", "ALPHA_MIN", "ALPHA_MAX", "TRANSMITTANCE_STOP", "FRUSTUM_MARGIN",
+)  # fmt: skip
+
+
+def sources() -> list[str]:
+    """Return the names of all sources."""
+    return sorted(path.stem for path in HERE.glob("*.cu"))
+
+
+def definitions() -> dict[str, str]:
+    """Return the macros that every source is compiled with."""
+    values = {name: f"{getattr(constants, name)!r}f" for name in _CONSTANTS}
+    values["LOG2_ALPHA_MIN"] = f"{math.log2(constants.ALPHA_MIN)!r}f"
+    return values | {"TILE": str(constants.TILE), "MOST_VIEWS": str(MOST_VIEWS)}
+
+
+def target(nvrtc: Nvrtc, capability: int) -> tuple[str, str]:
+    """Return what to compile for on a card, as an option and as a form, see ``Nvrtc.compile``.
+
+    A card newer than the compiler gets PTX, from which its driver makes machine code.
+
+    Raises:
+        GsdmsrError: the card is older than every architecture of the compiler.
+    """
+    known = nvrtc.architectures()
+    if capability in known:
+        return f"sm_{capability}", "CUBIN"
+    older = [architecture for architecture in known if architecture < capability]
+    if not older:
+        raise GsdmsrError(
+            f"the card is of compute capability {capability}, older than {known[0]}, the oldest "
+            f"that NVRTC {nvrtc.version[0]}.{nvrtc.version[1]} compiles for; use --device cpu"
+        )
+    return f"compute_{older[-1]}", "PTX"
+
+
+def compiled(nvrtc: Nvrtc, source: str, capability: int) -> bytes:
+    """Return the program of a source, from the cache if it has been compiled before.
+
+    Raises:
+        GsdmsrError: it does not compile.
+    """
+    architecture, form = target(nvrtc, capability)
+    path = _cache_folder(nvrtc.version) / f"{source}.{architecture}.{form.lower()}"
+    if path.is_file():
+        return path.read_bytes()
+    program = translate(nvrtc, source, architecture, form)[0]
+    with contextlib.suppress(OSError):  # a cache that cannot be written costs time, nothing else
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with replacing(path) as beside:
+            beside.write_bytes(program)
+    return program
+
+
+def translate(
+    nvrtc: Nvrtc, source: str, architecture: str, form: str, *further: str
+) -> tuple[bytes, str]:
+    """Compile a source with ``further`` options; return the program and the compiler's log."""
+    macros = [f"--define-macro={name}={value}" for name, value in definitions().items()]
+    options = [f"--gpu-architecture={architecture}", *_OPTIONS, *macros, *further]
+    headers = {path.name: path.read_text(encoding="utf-8") for path in HERE.glob("*.cuh")}
+    text = (HERE / f"{source}.cu").read_text(encoding="utf-8")
+    return nvrtc.compile(f"{source}.cu", text, headers, options, form)
+
+
+@cache
+def _cache_folder(version: tuple[int, int]) -> Path:
+    """Return the folder of compiled programs; its name is a hash of all that they depend on."""
+    digest = hashlib.sha256(repr((version, _OPTIONS, definitions())).encode())
+    for path in sorted((*HERE.glob("*.cu"), *HERE.glob("*.cuh"))):
+        digest.update(path.name.encode() + path.read_bytes())
+    home = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache"))
+    return home / "gsdmsr" / "cuda" / digest.hexdigest()[:16]

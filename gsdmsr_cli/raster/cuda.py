@@ -1,0 +1,230 @@
+"""The CUDA engine: kernels compiled at run time, behind autograd functions per group of stages."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.autograd import Function
+from torch.autograd.function import once_differentiable
+
+from gsdmsr_cli.camera import Camera
+from gsdmsr_cli.cuda import stages
+from gsdmsr_cli.cuda.availability import missing
+from gsdmsr_cli.frame import Frame
+from gsdmsr_cli.raster import Comparison
+from gsdmsr_cli.splats import Splats
+
+
+def unavailable(device: str) -> str | None:
+    """Return why the engine cannot draw on ``device``, or None if it can."""
+    return "it draws tensors that lie in the memory of a GPU" if device == "cpu" else missing()
+
+
+def rasterize(
+    splats: Splats,
+    camera: Camera,
+    background: Tensor,
+    sh_degree: int | None = None,
+    with_depth: bool = False,
+) -> Frame:
+    """Draw float32 splats; see ``gsdmsr_cli.raster``.
+
+    Where gradients are wanted nothing waits for the GPU; see ``cuda.room`` for what that may cost.
+    """
+    views, stored = stages.views_of([camera]), _stored(splats)
+    exact = not (torch.is_grad_enabled() and any(t.requires_grad for t in stored))
+    means2d, shapes, paints, radii, keys, counts = _Project.apply(
+        views, _terms(splats, sh_degree), *stored
+    )
+    projected = stages.Projected(means2d, shapes, paints, radii, keys, counts)
+    bins = stages.bin_splats(views, projected, exact)
+    rgb, alpha, *depth = _Blend.apply(
+        views, bins, _to(background, means2d), with_depth, means2d, shapes, paints
+    )
+    return Frame(
+        rgb=rgb[0].permute(1, 2, 0),
+        alpha=alpha[0],
+        depth=depth[0][0] if depth else None,
+        radii=radii,
+        means2d=means2d,
+    )
+
+
+def compare(
+    splats: Splats,
+    camera: Camera,
+    background: Tensor,
+    target: Tensor,
+    ssim_weight: float,
+    sh_degree: int | None = None,
+    tile_weights: Tensor | None = None,
+) -> Comparison:
+    """Draw float32 splats and compare, without waiting for the GPU; see ``gsdmsr_cli.raster``."""
+    weights = None if tile_weights is None else [tile_weights]
+    given = [splats], [camera], background, [target], ssim_weight, sh_degree, weights
+    loss, (view,) = compare_views(*given)
+    return view._replace(loss=loss)
+
+
+def compare_views(
+    splats: Sequence[Splats],
+    cameras: Sequence[Camera],
+    background: Tensor,
+    targets: Sequence[Tensor],
+    ssim_weight: float,
+    sh_degree: int | None = None,
+    tile_weights: Sequence[Tensor] | None = None,
+) -> tuple[Tensor, list[Comparison]]:
+    """Draw and compare several views at once, each as ``compare`` does.
+
+    Args:
+        splats: of each view, such as one model's at several times; what is the very same tensor in
+            all of them is read in place, what differs is copied.
+        cameras: of each view, all of one picture size.
+        background, ssim_weight, sh_degree: of all views.
+        targets, tile_weights: of each view.
+
+    Returns:
+        the sum of the losses, which gradients come from, and what is to be said of each view, with
+        losses that have none.
+
+    Raises:
+        ValueError: there are no views, more than ``MOST_VIEWS``, or they differ in size.
+    """
+    if tile_weights is not None and ssim_weight > 0:
+        raise ValueError("tiles cannot be weighted where SSIM counts, whose windows overlap them")
+    parts = zip(*(own.tensors().values() for own in splats), strict=True)
+    stored = [_together(part) for part in parts]
+    loss, losses, on_screen, errors = _Look.apply(
+        stages.views_of(cameras), _terms(splats[0], sh_degree), _to(background, stored[0]),
+        targets, ssim_weight, None if tile_weights is None else torch.cat([*tile_weights]), *stored,
+    )  # fmt: skip
+    each = zip(losses, on_screen.view(len(splats), -1, 2), errors, strict=True)
+    return loss, [Comparison(*view[:2], None if ssim_weight > 0 else view[2]) for view in each]
+
+
+def _together(tensors: Sequence[Tensor]) -> Tensor:
+    """Return the one tensor that all views share, or all of them stacked."""
+    first = tensors[0]
+    shared = all(tensor is first for tensor in tensors)
+    return first.contiguous() if shared else torch.stack([*tensors])
+
+
+def _stored(splats: Splats) -> list[Tensor]:
+    return [tensor.contiguous() for tensor in splats.tensors().values()]
+
+
+def _terms(splats: Splats, sh_degree: int | None) -> int:
+    """Return how many coefficients of colour are used."""
+    degree = splats.sh_degree if sh_degree is None else min(sh_degree, splats.sh_degree)
+    return (degree + 1) ** 2
+
+
+def _to(background: Tensor, like: Tensor) -> Tensor:
+    return background.detach().to(like).contiguous()
+
+
+class _Project(Function):
+    """Stored splats to screen positions, shapes and paints."""
+
+    @staticmethod
+    def forward(ctx: Any, views: stages.Views, terms: int, *stored: Tensor) -> tuple[Tensor, ...]:
+        projected = stages.project(views, stored, terms)
+        ctx.views, ctx.terms = views, terms
+        ctx.save_for_backward(*stored, projected.shapes, projected.paints, projected.radii)
+        ctx.mark_non_differentiable(projected.radii, projected.keys, projected.counts)
+        ctx.set_materialize_grads(True)
+        return tuple(projected)
+
+    @staticmethod
+    @once_differentiable  # type: ignore[untyped-decorator]
+    def backward(
+        ctx: Any, d_means2d: Tensor, d_shapes: Tensor, d_paints: Tensor, *_: Any
+    ) -> tuple[Tensor | None, ...]:
+        *stored, shapes, paints, radii = ctx.saved_tensors
+        given = d_means2d.contiguous(), d_shapes.contiguous(), d_paints.contiguous()
+        gradients = stages.project_backward(
+            ctx.views, stored, ctx.terms, (shapes, paints, radii), given
+        )
+        return None, None, *gradients
+
+
+class _Blend(Function):
+    """Binned splats to pictures; gradients for all but the bins and the background."""
+
+    @staticmethod
+    def forward(
+        ctx: Any,
+        views: stages.Views,
+        bins: stages.Bins,
+        background: Tensor,
+        with_depth: bool,
+        *projected: Tensor,
+    ) -> tuple[Tensor, ...]:
+        means2d, shapes, paints = projected
+        drawn = stages.blend(views, (means2d, shapes, paints), bins, background, with_depth)
+        there = tuple(picture for picture in drawn if picture is not None)
+        ctx.views, ctx.bins = views, bins
+        ctx.save_for_backward(*projected, *there)
+        ctx.set_materialize_grads(False)
+        return there
+
+    @staticmethod
+    @once_differentiable  # type: ignore[untyped-decorator]
+    def backward(
+        ctx: Any, d_rgb: Tensor | None, d_alpha: Tensor | None, d_depth: Tensor | None = None
+    ) -> tuple[Tensor | None, ...]:
+        means2d, shapes, paints, rgb, alpha, *depth = ctx.saved_tensors
+        given = [None if d is None else d.contiguous() for d in (d_rgb, d_alpha, d_depth)]
+        d_rgb = torch.zeros_like(rgb) if given[0] is None else given[0]
+        sums = stages.blend_backward(
+            ctx.views, (means2d, shapes, paints), ctx.bins,
+            (rgb, alpha, depth[0] if depth else None), (d_rgb, given[1], given[2]),
+        )  # fmt: skip
+        return None, None, None, None, *stages.gather(shapes, sums, weighted=False)[0]
+
+
+class _Look(Function):
+    """Stored splats to losses; their gradients are taken at once, and only passed on later."""
+
+    @staticmethod
+    def forward(
+        ctx: Any,
+        views: stages.Views,
+        terms: int,
+        background: Tensor,
+        targets: Sequence[Tensor],
+        ssim_weight: float,
+        tile_weights: Tensor | None,
+        *stored: Tensor,
+    ) -> tuple[Tensor, ...]:
+        found = stages.project(views, stored, terms)
+        bins = stages.bin_splats(views, found, exact=False)
+        projected = found.means2d, found.shapes, found.paints
+        if ssim_weight > 0:
+            drawn = stages.blend(views, projected, bins, background, with_depth=False)
+            losses, d_rgb = stages.compare(views, drawn[0], targets, ssim_weight)
+            sums = stages.blend_backward(views, projected, bins, drawn, (d_rgb, None, None))
+            errors = losses.new_empty(views.number, 0)
+        else:
+            errors, sums = stages.blend_l1(
+                views, projected, bins, background, targets, tile_weights
+            )
+            weighted = errors if tile_weights is None else errors * tile_weights.view_as(errors)
+            losses = weighted.sum(dim=1) / (3 * views.width * views.height)
+        given, on_screen = stages.gather(found.shapes, sums, tile_weights is not None)
+        ctx.gradients = stages.project_backward(
+            views, stored, terms, (found.shapes, found.paints, found.radii), given
+        )
+        ctx.mark_non_differentiable(losses, on_screen, errors)
+        return losses.sum().float(), losses, on_screen, errors
+
+    @staticmethod
+    @once_differentiable  # type: ignore[untyped-decorator]
+    def backward(ctx: Any, d_loss: Tensor, *_: Any) -> tuple[Tensor | None, ...]:
+        # always multiplied: whether the slope is 1 would have to be waited for
+        passed = torch._foreach_mul(ctx.gradients, d_loss)
+        return None, None, None, None, None, None, *passed

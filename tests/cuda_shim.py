@@ -1,0 +1,77 @@
+"""Builds the kernels for the CPU with g++ and runs them in place of the driver."""
+
+from __future__ import annotations
+
+import ctypes
+import re
+import shutil
+import subprocess
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import torch
+
+from gsdmsr_cli.cuda import compiler, launch
+
+SHIM = Path(__file__).parent / "cuda" / "shim"
+MISSING = None if shutil.which("g++") else "there is no g++ to build the kernels for the CPU with"
+_KERNEL = re.compile(r'extern "C" __global__ void (?:__launch_bounds__\([^)]*\) )?(\w+)\(')
+
+
+def kernels_of(source: str) -> list[str]:
+    """Return the names of the kernels of a source."""
+    return _KERNEL.findall((compiler.HERE / f"{source}.cu").read_text(encoding="utf-8"))
+
+
+class Shim:
+    """Runs kernels on tensors in the memory of the CPU, see ``launch.Runner``."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._libraries: dict[str, ctypes.CDLL] = {}
+
+    def launch(
+        self,
+        source: str,
+        kernel: str,
+        grid: tuple[int, int],
+        block: int,
+        arguments: ctypes.Array[ctypes.c_void_p],
+        device: torch.device,
+    ) -> None:
+        if source not in self._libraries:
+            self._libraries[source] = ctypes.CDLL(str(self._build(source)))
+        getattr(self._libraries[source], f"run_{kernel}")(*grid, block, arguments)
+
+    def _build(self, source: str) -> Path:
+        runners = [
+            f'extern "C" void run_{kernel}(int x, int y, int threads, void **given) {{\n'
+            f"    auto work = [](void *given) {{ shim::call({kernel}, (void **)given); }};\n"
+            f"    shim::run_grid(x, y, threads, work, given);\n}}\n"
+            for kernel in kernels_of(source)
+        ]
+        text = f'#include "shim.h"\n#include "{source}.cu"\n' + "".join(runners)
+        program, library = self._folder / f"{source}.cpp", self._folder / f"{source}.so"
+        if library.is_file():
+            return library
+        program.write_text(text, encoding="utf-8")
+        macros = [f"-D{name}={value}" for name, value in compiler.definitions().items()]
+        line = ["g++", "-std=c++17", "-O1", "-shared", "-fPIC", "-U_FORTIFY_SOURCE", "-w"]
+        places = [f"-I{SHIM}", f"-I{compiler.HERE}", "-o", str(library), str(program)]
+        done = subprocess.run(
+            [*line, *macros, *places], capture_output=True, text=True, check=False
+        )
+        assert done.returncode == 0, done.stderr
+        return library
+
+
+@contextmanager
+def on_the_cpu(folder: Path) -> Iterator[Shim]:
+    """Let kernels of tensors in the memory of the CPU be run by the shim."""
+    shim = Shim(folder)
+    launch.runners["cpu"] = shim
+    try:
+        yield shim
+    finally:
+        del launch.runners["cpu"]
