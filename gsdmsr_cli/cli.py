@@ -18,7 +18,7 @@ from typing import Annotated, Literal, cast
 import typer
 
 from gsdmsr_cli import __version__
-from gsdmsr_cli.errors import GsdmsrError, UsageError
+from gsdmsr_cli.errors import GsdmsrError, UsageError, nearest
 
 # Commands are imported in the function that runs them: torch alone would make --help slow.
 
@@ -69,6 +69,66 @@ def _common(
     ] = False,
 ) -> None:
     pass
+
+
+@app.command()
+def prepare(
+    given: Annotated[
+        Path, typer.Argument(metavar="INPUT", help="Video, or folder of pictures or videos.")
+    ],
+    out: Annotated[Path, typer.Option(metavar="SCENE", help="Scene folder to write.")],
+    format_: Annotated[
+        Literal["video", "images"] | None,
+        typer.Option("--format", help="What INPUT is, where it is not plain."),
+    ] = None,
+    frames: Annotated[int, typer.Option(min=8, metavar="N", help="Most frames to take.")] = 60,
+    max_side: Annotated[
+        int, typer.Option(min=64, metavar="N", help="Longer side of the pictures [px].")
+    ] = 1600,
+    features: Annotated[
+        int, typer.Option(min=100, metavar="N", help="Most features of a frame.")
+    ] = 2048,
+    camera_model: Annotated[
+        str, typer.Option(metavar="NAME", help="COLMAP's name of the lens.")
+    ] = "SIMPLE_RADIAL",
+    matching: Annotated[
+        Literal["auto", "sequential", "exhaustive", "both"],
+        typer.Option(help="Which frames are compared with one another."),
+    ] = "auto",
+    mapping: Annotated[
+        Literal["incremental", "global"], typer.Option(help="COLMAP's mapper.")
+    ] = "incremental",
+    min_registered: Annotated[
+        float, typer.Option(min=0.0, max=1.0, metavar="X", help="Share that must have cameras.")
+    ] = 0.75,
+    test_every: Annotated[
+        int, typer.Option(min=0, metavar="N", help="Every N-th frame is for testing; 0: none.")
+    ] = 8,
+    seed: Annotated[int, typer.Option(min=0, metavar="N", help="Seed of random choices.")] = 0,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Replace an earlier SCENE.")
+    ] = False,
+    as_json: Json = False,
+) -> None:
+    """Turn a video or pictures into a scene with cameras."""
+    from gsdmsr_cli.capture.options import CAMERA_MODELS, Options
+
+    if camera_model not in CAMERA_MODELS:
+        raise UsageError(f"--camera-model {camera_model}: {nearest(camera_model, CAMERA_MODELS)}")
+    options = Options(
+        frames=frames,
+        max_side=max_side,
+        features=features,
+        camera_model=camera_model,
+        matching=matching,
+        mapping=mapping,
+        min_registered=min_registered,
+        test_every=test_every,
+        seed=seed,
+    )
+    from gsdmsr_cli.commands import prepare as command
+
+    command.run(given, out, format_, options, overwrite, as_json)
 
 
 @app.command()
@@ -152,44 +212,19 @@ def evaluate(
         bool, typer.Option("--lpips-inria", help="LPIPS on [0, 1] too, as in tables after 3DGS.")
     ] = False,
     as_json: Json = False,
-    out: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Folder to write, if not RUN/eval.")
-    ] = None,
     fail_under: Annotated[
         list[str] | None,
-        typer.Option(metavar="METRIC=VALUE", help="Exit with 4 if it is less; repeatable."),
+        typer.Option(metavar="METRIC=VALUE", help="Exit with 4 if worse; repeatable."),
     ] = None,
-    fail_over: Annotated[
-        list[str] | None,
-        typer.Option(metavar="METRIC=VALUE", help="Exit with 4 if it is more; repeatable."),
-    ] = None,
-    baseline: Annotated[
-        Path | None,
-        typer.Option(metavar="F.json", help="Exit with 4 if worse than this metrics.json."),
-    ] = None,
-    tolerance: Annotated[
-        list[str] | None,
-        typer.Option(metavar="METRIC=VALUE", help="How much worse it may be; repeatable."),
-    ] = None,
-    junit: Annotated[
-        Path | None, typer.Option(metavar="F.xml", help="Write what passed as JUnit XML.")
-    ] = None,
-    github_summary: Annotated[
-        bool, typer.Option("--github-summary", help="Append to the summary of GitHub Actions.")
-    ] = False,
     data: MovedData = None,
 ) -> None:
     """Measure a run on views it has not seen."""
-    from gsdmsr_cli.evaluation.request import Demands, Output, Request
+    from gsdmsr_cli.evaluation.request import Request
 
     request = Request(split, background, downscale, lpips_weights, lpips_inria)
-    demands = Demands(
-        tuple(fail_under or ()), tuple(fail_over or ()), baseline, tuple(tolerance or ())
-    )
-    output = Output(out, as_json, junit, github_summary)
     from gsdmsr_cli.commands import eval as command
 
-    command.run(run_folder, request, demands, output, data)
+    command.run(run_folder, request, as_json, fail_under or [], data)
 
 
 @app.command()

@@ -11,6 +11,7 @@ from gsdmsr_cli.commands import eval as evaluate
 from gsdmsr_cli.commands import render, train
 from gsdmsr_cli.commands._progress import progress_bar
 from gsdmsr_cli.errors import DataError, UsageError
+from gsdmsr_cli.evaluation import request as evaluation
 from gsdmsr_cli.filming.request import Request
 from gsdmsr_cli.synthetic import write_scene
 
@@ -33,7 +34,7 @@ def run(out: Path) -> None:
     _write_scene(scene)
     overrides = [f"training.budget={BUDGET}"]
     train.run(scene, run_folder, "dnerf", None, overrides, "auto", False, run_folder.exists())
-    evaluate.run(run_folder)
+    evaluate.run(run_folder, evaluation.Request())
     render.run(run_folder, Request(), None)
     Console().out(_where_to_look(scene, run_folder), highlight=False)
 

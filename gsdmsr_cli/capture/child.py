@@ -1,0 +1,57 @@
+"""COLMAP's stages in a process of their own, which ends at once with ours."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from gsdmsr_cli.errors import DataError, GsdmsrError
+
+REFUSED = 3
+"""Exit code of a child that has told, on its last line, why the data cannot be used."""
+
+
+def run_child(job: str, arguments: Mapping[str, Any], tell: Callable[[int, int], None]) -> None:
+    """Do a job of ``capture.colmap`` and wait for it; whatever happens, it has ended afterwards.
+
+    Args:
+        job: name of the job.
+        arguments: what it takes, fit for JSON.
+        tell: called with how much is done, and of how much.
+
+    Raises:
+        DataError: the job says that the data cannot be used.
+        GsdmsrError: the job has failed.
+    """
+    line = [sys.executable, "-m", "gsdmsr_cli.capture.colmap", job, json.dumps(arguments)]
+    last = ""
+    # in a session of its own: Ctrl-C is for us, who then end it
+    with (
+        tempfile.TemporaryFile("w+", errors="replace") as said,
+        subprocess.Popen(
+            line, stdout=subprocess.PIPE, stderr=said, text=True, start_new_session=True
+        ) as process,
+    ):
+        try:
+            assert process.stdout is not None
+            for text in process.stdout:
+                match text.split():
+                    case ["progress", done, total]:
+                        tell(int(done), int(total))
+                    case _:
+                        last = text.strip()
+            code = process.wait()
+        except BaseException:
+            process.kill()
+            raise
+        if code == REFUSED:
+            raise DataError(last)
+        if code:
+            said.seek(0)
+            words = [word.strip() for word in said.read().split("\n") if word.strip()]
+            reason = words[-1] if words else f"exit code {code}"
+            raise GsdmsrError(f"COLMAP has failed while {job}ing: {reason}")

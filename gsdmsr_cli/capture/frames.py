@@ -1,0 +1,269 @@
+"""Which pictures of a capture become frames, at which times; written upright, in one size."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gsdmsr_cli.capture.exif import Notes, read_notes, upright
+from gsdmsr_cli.capture.source import Source
+from gsdmsr_cli.capture.video import read_video, video_length
+from gsdmsr_cli.errors import DataError
+from gsdmsr_cli.files import read_json, write_json
+from gsdmsr_cli.imaging import read_image, write_png
+from gsdmsr_cli.native import cv2
+
+Picture = NDArray[np.uint8]
+Tell = Callable[[int, int], None]
+
+LEAST = 8
+"""Fewer frames do not make a scene."""
+
+BLURRED = 0.2
+"""Frames are left out whose sharpness is below this share of their neighbours' median."""
+
+NEIGHBOURS = 5
+"""So many frames before and after one are its neighbours."""
+
+_LOOKED_AT = 640  # longer side at which sharpness is measured [px]
+_PICTURES = "pictures"
+_NOTE = "frames.json"
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A picture that might become a frame.
+
+    Attributes:
+        file: name of the picture or video.
+        index: number of the frame in its video.
+        time: seconds, or steps where nothing tells seconds, from the first.
+        sharpness: variance of the Laplacian, or 0 where it has not been looked at.
+    """
+
+    file: str
+    index: int
+    time: float
+    sharpness: float = 0.0
+
+
+@dataclass(frozen=True)
+class Frames:
+    """The chosen frames in the order of time.
+
+    Attributes:
+        folder: of their pictures.
+        names: of their files.
+        taken: what each was.
+        of_pictures: whether each is a file of its own, not a part of a video.
+        in_seconds: whether times are seconds.
+        size: width and height [px].
+        focal: focal length that the camera has noted [px], or None.
+        blurred: those that were left out because they are blurred.
+    """
+
+    folder: Path
+    names: tuple[str, ...]
+    taken: tuple[Candidate, ...]
+    of_pictures: bool
+    in_seconds: bool
+    size: tuple[int, int]
+    focal: float | None
+    blurred: tuple[Candidate, ...]
+
+    @property
+    def times(self) -> list[float]:
+        """Time of every frame in [0, 1], over all that were chosen."""
+        times = [frame.time for frame in self.taken]
+        return [(time - times[0]) / (times[-1] - times[0]) for time in times]
+
+    @property
+    def duration(self) -> float | None:
+        """Seconds from the first frame to the last, where they are known."""
+        return self.taken[-1].time - self.taken[0].time if self.in_seconds else None
+
+
+def write_frames(folder: Path, source: Source, count: int, max_side: int, tell: Tell) -> None:
+    """Choose frames from the source and write them and a note of them into ``folder``.
+
+    Raises:
+        DataError: a file cannot be read, there are too few frames, or they differ in size.
+    """
+    survey = _survey_videos if source.kind == "video" else _survey_pictures
+    candidates, in_seconds, notes = survey(source, count, tell)
+    chosen = choose(candidates, count)
+    taken, blurred = leave_out_blurred(chosen)
+    if len(taken) < LEAST:
+        raise DataError(
+            f"{source.root}: {len(taken)} usable frames of {len(candidates)}; at least {LEAST} are "
+            "needed: film for longer, or give more pictures"
+        )
+    (folder / _PICTURES).mkdir()
+    names = tuple(f"{i:05d}.png" for i in range(len(taken)))
+    sizes = []
+    for i, picture in enumerate(_pictures(source, taken, notes)):
+        shrunk = _shrunk(picture, max_side)
+        sizes.append((shrunk.shape[1], shrunk.shape[0]))
+        if sizes[-1] != sizes[0]:
+            raise DataError(
+                f"{source.root}: {taken[i].file} is {_size(picture)} px, unlike {taken[0].file}; "
+                "all must have one size: they share one lens"
+            )
+        write_png(folder / _PICTURES / names[i], shrunk)
+        tell(len(candidates) + i + 1, len(candidates) + len(taken))
+    focals = {note.focal for note in notes.values()}
+    focal = focals.pop() if len(focals) == 1 else None
+    write_json(
+        folder / _NOTE,
+        {
+            "frames": [asdict(frame) for frame in taken],
+            "blurred": [asdict(frame) for frame in blurred],
+            "of_pictures": source.kind == "images",
+            "in_seconds": in_seconds,
+            "size": sizes[0],
+            "focal": None if focal is None else focal * math.hypot(*sizes[0]),
+        },
+    )
+
+
+def read_frames(folder: Path) -> Frames:
+    """Return what ``write_frames`` has written."""
+    note: dict[str, Any] = read_json(folder / _NOTE)
+    taken = tuple(Candidate(**frame) for frame in note["frames"])
+    return Frames(
+        folder=folder / _PICTURES,
+        names=tuple(f"{i:05d}.png" for i in range(len(taken))),
+        taken=taken,
+        of_pictures=note["of_pictures"],
+        in_seconds=note["in_seconds"],
+        size=(note["size"][0], note["size"][1]),
+        focal=note["focal"],
+        blurred=tuple(Candidate(**frame) for frame in note["blurred"]),
+    )
+
+
+def choose(candidates: Sequence[Candidate], count: int) -> list[Candidate]:
+    """Return the sharpest candidate of each of ``count`` equal parts of the time; all if fewer."""
+    if len(candidates) <= count:
+        return list(candidates)
+    first, last = candidates[0].time, candidates[-1].time
+    bins: dict[int, Candidate] = {}
+    for candidate in candidates:
+        part = min(int((candidate.time - first) / (last - first) * count), count - 1)
+        if part not in bins or candidate.sharpness > bins[part].sharpness:
+            bins[part] = candidate
+    return list(bins.values())
+
+
+def leave_out_blurred(chosen: Sequence[Candidate]) -> tuple[list[Candidate], list[Candidate]]:
+    """Return the frames that are as sharp as their neighbours, and those that are not nearly so.
+
+    Sharpness depends on what is seen, so only frames close in time are compared.
+    """
+    taken: list[Candidate] = []
+    blurred: list[Candidate] = []
+    for i, frame in enumerate(chosen):
+        near = [other.sharpness for other in chosen[max(i - NEIGHBOURS, 0) : i + NEIGHBOURS + 1]]
+        poor = frame.sharpness < BLURRED * float(np.median(near))
+        (blurred if poor else taken).append(frame)
+    return taken, blurred
+
+
+def sharpness(picture: Picture) -> float:
+    """Return the variance of the Laplacian of (H, W, C) pixels at a common size."""
+    grey = cv2.cvtColor(_shrunk(picture, _LOOKED_AT), cv2.COLOR_RGB2GRAY)
+    return float(cv2.Laplacian(grey, cv2.CV_32F).var())
+
+
+_Survey = tuple[list[Candidate], bool, dict[str, Notes]]
+
+
+def _survey_videos(source: Source, count: int, tell: Tell) -> _Survey:
+    """Look at every frame of the videos, which follow one another without a gap."""
+    total = sum(video_length(path) for path in source.files)
+    candidates: list[Candidate] = []
+    start = 0.0
+    for path in source.files:
+        before, step = len(candidates), 0.0
+        for index, (time, picture) in enumerate(read_video(path)):
+            step = start + time - candidates[-1].time if candidates else 0.0
+            candidates.append(Candidate(path.name, index, start + time, sharpness(picture)))
+            tell(len(candidates), total + min(count, total))
+        if len(candidates) - before > 1:
+            start = candidates[-1].time + step
+    return candidates, True, {}
+
+
+def _survey_pictures(source: Source, count: int, tell: Tell) -> _Survey:
+    notes = {path.name: read_notes(path) for path in source.files}
+    times, in_seconds = _picture_times(source.files, [notes[p.name].taken for p in source.files])
+    order = np.argsort(times, kind="stable")
+    files = [source.files[i] for i in order]
+    with ThreadPoolExecutor() as pool:
+        looked = pool.map(lambda path: sharpness(_rgb(read_image(path))), files)
+        candidates = []
+        for i, sharp in zip(order, looked, strict=True):
+            time = times[i] - min(times)
+            candidates.append(Candidate(source.files[i].name, 0, time, sharp))
+            tell(len(candidates), len(files) + min(count, len(files)))
+    return candidates, in_seconds, notes
+
+
+def _picture_times(
+    files: Sequence[Path], taken: Sequence[float | None]
+) -> tuple[list[float], bool]:
+    """Return each picture's time, and whether it is in seconds.
+
+    The cameras' notes where all pictures have one of their own; else the numbers that the names end
+    in, where those differ; else the order of the names.
+    """
+    known = [time for time in taken if time is not None]
+    if len(set(known)) == len(files):
+        return known, True
+    numbers = [re.search(r"(\d+)\D*$", path.stem) for path in files]
+    counted = [float(match[1]) for match in numbers if match]
+    if len(set(counted)) == len(files):
+        return counted, False
+    return [float(i) for i in range(len(files))], False
+
+
+def _pictures(
+    source: Source, taken: Sequence[Candidate], notes: dict[str, Notes]
+) -> Iterator[Picture]:
+    """Yield the chosen pictures, (H, W, 3), in the order of time."""
+    paths = {path.name: path for path in source.files}
+    if source.kind == "images":
+        for frame in taken:
+            picture = _rgb(read_image(paths[frame.file]))
+            yield upright(picture, notes[frame.file].orientation)
+        return
+    for name, path in paths.items():
+        wanted = {frame.index for frame in taken if frame.file == name}
+        for index, (_, picture) in enumerate(read_video(path) if wanted else ()):
+            if index in wanted:
+                yield picture
+
+
+def _rgb(picture: Picture) -> Picture:
+    return picture[..., :3] if picture.shape[2] >= 3 else np.repeat(picture[..., :1], 3, axis=2)
+
+
+def _shrunk(picture: Picture, max_side: int) -> Picture:
+    height, width, _ = picture.shape
+    scale = max_side / max(width, height)
+    if scale >= 1:
+        return picture
+    shape = max(1, round(width * scale)), max(1, round(height * scale))
+    return np.asarray(cv2.resize(picture, shape, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+
+
+def _size(picture: Picture) -> str:
+    return f"{picture.shape[1]} x {picture.shape[0]}"

@@ -1,0 +1,40 @@
+"""What may be asked of ``prepare``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+KINDS = ("video", "images")
+CAMERA_MODELS = (
+    "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE",
+)  # fmt: skip
+MATCHINGS = ("auto", "sequential", "exhaustive", "both")
+MAPPINGS = ("incremental", "global")
+
+
+@dataclass(frozen=True)
+class Options:
+    """How a capture becomes a scene; every value changes what is written.
+
+    Attributes:
+        frames: most frames to take.
+        max_side: longer side of the pictures, which are shrunk to it [px].
+        features: most features of a frame.
+        camera_model: COLMAP's name of the lens that all frames share.
+        matching: which frames are compared: neighbours in time, all, or neighbours and, of a few
+            evenly chosen, all; ``auto`` is exhaustive for small folders of pictures.
+        mapping: COLMAP's incremental mapper or its global one.
+        min_registered: share of the frames whose cameras must be found.
+        test_every: every so many frames one is kept for testing; 0 keeps none.
+        seed: of COLMAP's random choices.
+    """
+
+    frames: int = 60
+    max_side: int = 1600
+    features: int = 2048
+    camera_model: str = "SIMPLE_RADIAL"
+    matching: str = "auto"
+    mapping: str = "incremental"
+    min_registered: float = 0.75
+    test_every: int = 8
+    seed: int = 0

@@ -1,0 +1,99 @@
+"""Features, pairs, lenses and epipolar geometry, against OpenCV, COLMAP and closed forms."""
+
+from __future__ import annotations
+
+from itertools import combinations
+
+import cv2
+import numpy as np
+import pytest
+import room
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gsdmsr_cli.capture.consistency import essential_matrix, rays_of, sampson_distance
+from gsdmsr_cli.capture.features import find_features
+from gsdmsr_cli.capture.options import CAMERA_MODELS, MATCHINGS
+from gsdmsr_cli.capture.pairs import NEIGHBOURS, choose_pairs
+from gsdmsr_cli.capture.reconstruction import lens_of
+from gsdmsr_cli.capture.settle import is_test, upright
+from gsdmsr_cli.native import load_pycolmap
+
+PARAMS = {
+    "SIMPLE_PINHOLE": [500.0, 320.0, 236.0],
+    "PINHOLE": [500.0, 510.0, 320.0, 236.0],
+    "SIMPLE_RADIAL": [500.0, 320.0, 236.0, -0.08],
+    "RADIAL": [500.0, 320.0, 236.0, -0.08, 0.02],
+    "OPENCV": [500.0, 510.0, 320.0, 236.0, -0.08, 0.02, 1e-3, -2e-3],
+    "OPENCV_FISHEYE": [500.0, 510.0, 320.0, 236.0, -0.05, 0.01, 0.002, -0.001],
+}
+
+
+@pytest.mark.parametrize("model", CAMERA_MODELS)
+def test_lenses_project_as_colmap_does(model: str) -> None:
+    colmap = load_pycolmap()
+    camera = colmap.Camera(model=model, width=640, height=480, params=PARAMS[model])
+    lens = lens_of(camera.model_name, camera.params, 640, 480)
+    rays = np.random.default_rng(0).uniform(-0.5, 0.5, (50, 2))
+    expected = camera.img_from_cam(np.hstack([rays, np.ones((50, 1))]))
+    np.testing.assert_allclose(np.stack(lens.project(*rays.T), 1), expected, atol=1e-9)
+    back = rays_of(lens, expected.astype(np.float32))
+    np.testing.assert_allclose(back, rays, atol=1e-6)
+
+
+@given(st.integers(2, 150), st.sampled_from(MATCHINGS), st.booleans())
+def test_pairs_are_ascending_and_connect_neighbours(count: int, matching: str, video: bool) -> None:
+    pairs = choose_pairs(count, matching, video)
+    assert pairs == sorted(set(pairs)) and all(0 <= i < j < count for i, j in pairs)
+    near = {(i, j) for i, j in combinations(range(count), 2) if j - i <= NEIGHBOURS}
+    assert near <= set(pairs)
+    if matching == "exhaustive" or (matching == "auto" and not video and count <= 40):
+        assert len(pairs) == count * (count - 1) // 2
+    if matching == "both":
+        assert (0, count - 1) in pairs
+
+
+def test_features_are_in_pixels_of_the_frame_itself() -> None:
+    """A picture at twice the size has its features at twice the places, counted from the corner."""
+    grey = np.asarray(cv2.cvtColor(room.draw(room.walk(3)[1], 320, 240)[0], cv2.COLOR_RGB2GRAY))
+    large = np.asarray(cv2.resize(grey, (2560, 1920), interpolation=cv2.INTER_NEAREST))
+    small, big = find_features(grey, 400), find_features(large, 400)
+    apart = np.linalg.norm(small.pixels[:, None] - big.pixels[None] / 8, axis=2).min(axis=1)
+    assert np.median(apart) < 0.2  # half a pixel less or more would be seen
+    assert small.descriptors.dtype == np.uint8 and len(small.pixels) >= 300
+    lengths = np.linalg.norm(small.descriptors.astype(float), axis=1)
+    assert np.abs(lengths - 512).max() < 15  # RootSIFT has unit length
+
+
+def test_a_blank_picture_has_no_features() -> None:
+    found = find_features(np.full((60, 80), 128, np.uint8), 100)
+    assert found.pixels.shape == (0, 2) and found.descriptors.shape == (0, 128)
+
+
+def test_standing_points_keep_to_their_epipolar_lines() -> None:
+    rng = np.random.default_rng(0)
+    first, second = (np.linalg.inv(pose) for pose in room.walk(2))
+    points = rng.uniform(-1, 1, (40, 3)) + np.array([0, 2, 0])
+    rays = [
+        (p[:, :2] / p[:, 2:]) for p in (points @ w[:3, :3].T + w[:3, 3] for w in (first, second))
+    ]
+    essential = essential_matrix(first, second)
+    assert sampson_distance(essential, *rays).max() < 1e-12
+    # a small step off the epipolar line is that far off, shared by both pictures
+    moved = rays[1] + np.array([0, 1e-5])
+    off = sampson_distance(essential, rays[0], moved)
+    assert 0 < off.max() <= 1e-5
+
+
+def test_up_becomes_the_z_axis() -> None:
+    tilt = cv2.Rodrigues(np.array([0.4, -0.3, 0.2]))[0]
+    rotations = np.stack([np.linalg.inv(pose)[:3, :3] for pose in room.walk(5)]) @ tilt
+    turn = upright(rotations)
+    assert turn @ turn.T == pytest.approx(np.eye(3)) and np.linalg.det(turn) > 0
+    up = turn @ -rotations[:, 1].mean(axis=0)
+    assert up[:2] == pytest.approx([0, 0], abs=1e-12) and up[2] > 0
+
+
+def test_every_eighth_view_is_for_testing_and_neither_end() -> None:
+    assert [i for i in range(40) if is_test(i, 8)] == [4, 12, 20, 28, 36]
+    assert not any(is_test(i, 0) for i in range(40))

@@ -1,0 +1,136 @@
+"""From pictures or a film of a room, drawn under known cameras, to a scene folder and back."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import room
+
+from gsdmsr_cli.formats import read_scene
+from gsdmsr_cli.imaging import read_image
+
+FRAMES = 14
+
+
+def prepare(*arguments: object) -> subprocess.CompletedProcess[str]:
+    line = [sys.executable, "-m", "gsdmsr_cli.cli", "prepare", *map(str, arguments)]
+    return subprocess.run(line, capture_output=True, text=True)
+
+
+@pytest.fixture(scope="module")
+def shots() -> room.Shots:
+    return room.film(room.walk(FRAMES))
+
+
+@pytest.fixture(scope="module")
+def pictures(shots: room.Shots, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return room.write_pictures(tmp_path_factory.mktemp("room") / "pictures", shots)
+
+
+@pytest.fixture(scope="module")
+def scene(pictures: Path) -> Path:
+    out = pictures.parent / "scene"
+    ended = prepare(pictures, "--out", out)
+    assert ended.returncode == 0, ended.stderr
+    return out
+
+
+def test_cameras_are_where_the_pictures_were_drawn(scene: Path, shots: room.Shots) -> None:
+    views = read_scene(scene).views
+    assert [view.name for view in views] == [f"{i:05d}" for i in range(FRAMES)]
+    centres = np.stack([view.camera.centre for view in views])
+    assert room.trajectory_error(centres, shots.poses[:, :3, 3]) < 0.003
+    for view in views:
+        assert view.camera.fx == pytest.approx(room.FOCAL * view.camera.width, rel=0.02)
+
+
+def test_the_world_is_upright_and_settled(scene: Path, shots: room.Shots) -> None:
+    read = read_scene(scene)
+    up = np.mean([-view.camera.rotation[1] for view in read.views], axis=0)
+    assert up / np.linalg.norm(up) == pytest.approx([0, 0, 1], abs=1e-6)
+    note = json.loads((scene / "scene.json").read_text())
+    assert read.bound == note["bound"] and note["gsdmsr"] == 1
+    inside = (np.abs(read.points) <= read.bound).all(axis=1)
+    assert inside.mean() > 0.9 and len(read.points) > 300
+
+
+def test_points_lie_where_their_colours_are_seen(scene: Path) -> None:
+    read = read_scene(scene)
+    view = read.views[5]
+    camera = view.camera
+    local = read.points @ camera.rotation.T + camera.translation
+    u = camera.fx * local[:, 0] / local[:, 2] + camera.cx
+    v = camera.fy * local[:, 1] / local[:, 2] + camera.cy
+    inside = (u > 1) & (u < camera.width - 1) & (v > 1) & (v < camera.height - 1)
+    picture = read_image(view.image_path)[v[inside].astype(int), u[inside].astype(int)] / 255
+    off = np.abs(picture - read.colours[inside]).mean(axis=1)
+    assert inside.sum() > 200 and np.median(off) < 0.05
+
+
+def test_splits_and_times(scene: Path) -> None:
+    views = read_scene(scene).views
+    assert [view.time for view in views] == pytest.approx([i / 13 for i in range(FRAMES)])
+    tests = [i for i, view in enumerate(views) if view.split == "test"]
+    assert tests == [4, 12]
+
+
+def test_the_report_says_how_good_the_cameras_are(scene: Path) -> None:
+    quality = json.loads((scene / "scene.json").read_text())["quality"]
+    assert quality["frames"]["registered"] == FRAMES and not quality["frames"]["dropped"]
+    assert quality["reprojection_px"] < 0.5 and quality["parallax_deg"] > 15
+    assert quality["moving_matches"] < 0.05 and quality["warnings"] == []
+    page = (scene / "report.html").read_text()
+    assert page.count("<svg") == 2 and "prefers-color-scheme:dark" in page
+
+
+def test_nothing_else_is_left_behind(scene: Path, pictures: Path) -> None:
+    names = {path.name for path in scene.iterdir()}
+    files = {"images", "transforms.json", "points.ply", "scene.json", "report.html"}
+    assert names == files | {"timings.json"}
+    assert not list(scene.rglob(".*")) and not list(pictures.parent.glob("*.stages"))
+
+
+def test_the_same_pictures_and_seed_give_the_same_bytes(scene: Path, pictures: Path) -> None:
+    again = pictures.parent / "again"
+    assert prepare(pictures, "--out", again).returncode == 0
+    files = sorted(path.relative_to(scene) for path in scene.rglob("*") if path.is_file())
+    assert files == sorted(p.relative_to(again) for p in again.rglob("*") if p.is_file())
+    for name in files:
+        if name.name != "timings.json":
+            assert (scene / name).read_bytes() == (again / name).read_bytes(), name
+
+
+def test_an_earlier_scene_is_replaced_only_if_asked(scene: Path, pictures: Path) -> None:
+    ended = prepare(pictures, "--out", scene)
+    assert ended.returncode == 2 and "--overwrite" in ended.stderr
+    ended = prepare(pictures, "--out", pictures, "--overwrite")
+    assert ended.returncode == 2 and "no scene of prepare's" in ended.stderr
+    assert len(list(pictures.iterdir())) == FRAMES
+
+
+def test_a_film_gives_a_scene_in_seconds(shots: room.Shots, tmp_path: Path) -> None:
+    film = room.write_film(tmp_path / "film.mp4", shots, fps=5)
+    ended = prepare(film, "--out", tmp_path / "scene", "--mapping", "global", "--json")
+    assert ended.returncode == 0, ended.stderr
+    told = json.loads(ended.stdout)
+    assert told["duration"] == pytest.approx((FRAMES - 1) / 5)
+    read = read_scene(tmp_path / "scene")
+    centres = np.stack([view.camera.centre for view in read.views])
+    assert room.trajectory_error(centres, shots.poses[:, :3, 3]) < 0.01
+
+
+def test_pictures_of_two_sizes_are_refused(pictures: Path, tmp_path: Path) -> None:
+    mixed = tmp_path / "mixed"
+    mixed.mkdir()
+    for i, path in enumerate(sorted(pictures.iterdir())):
+        picture = cv2.imread(str(path))
+        cv2.imwrite(str(mixed / path.name), picture[:, :300] if i == 9 else picture)
+    ended = prepare(mixed, "--out", tmp_path / "scene")
+    assert ended.returncode == 3 and "shot009.png is 300 x 240 px" in ended.stderr
+    assert not (tmp_path / "scene").exists()
