@@ -83,14 +83,14 @@ class SplatOptions:
     Attributes:
         count: number of random splats where the scene brings no points.
         start: where they lie: "box" evenly in the scene's box, "silhouettes" where the silhouettes
-            of the train views overlap.
+            of the train views overlap, "surfaces" where neighbouring train views agree.
         opacity: their opacity, between 0 and 1.
         sh_degree: highest degree of the spherical harmonics, 0 to 3.
         sh_start: progress at which degree 1 joins; higher degrees follow.
     """
 
     count: int = 2500
-    start: Literal["box", "silhouettes"] = "silhouettes"
+    start: Literal["box", "silhouettes", "surfaces"] = "silhouettes"
     opacity: float = 0.1
     sh_degree: int = 1
     sh_start: float = 0.3

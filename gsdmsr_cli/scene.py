@@ -50,7 +50,7 @@ class Scene:
         layout: name of the format it was read with.
         views: every view of every split, in file order.
         points: (P, 3) float32 initial points [world units]; P may be 0.
-        colours: (P, 3) float32 colours of the points in [0, 1].
+        colours: (P, 3) float32 colours of the points in [0, 1], or None where the format has none.
         duration: length of the capture [s], or None where the format does not say.
         bound: half edge of the box around the world's origin that holds what is to be
             reconstructed [world units], from the format's convention or the points.
@@ -61,7 +61,7 @@ class Scene:
     layout: str
     views: tuple[View, ...]
     points: NDArray[np.float32]
-    colours: NDArray[np.float32]
+    colours: NDArray[np.float32] | None
     duration: float | None
     bound: float
     fingerprint: str

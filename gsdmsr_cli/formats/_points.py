@@ -1,4 +1,4 @@
-"""Points to start from, as readers give them: positions and colours in [0, 1]."""
+"""Points to start from, as readers give them: positions and colours in [0, 1] if they have them."""
 
 from __future__ import annotations
 
@@ -10,11 +10,8 @@ from numpy.typing import NDArray
 from gsdmsr_cli.errors import DataError
 from gsdmsr_cli.vertices import read_vertices
 
-Points = tuple[NDArray[np.float64], NDArray[np.float32]]
-"""(P, 3) positions and (P, 3) colours."""
-
-GREY = 0.5
-"""Colour of points that have none."""
+Points = tuple[NDArray[np.float64], NDArray[np.float32] | None]
+"""(P, 3) positions and (P, 3) colours, or None for the latter."""
 
 
 def none() -> Points:
@@ -23,9 +20,8 @@ def none() -> Points:
 
 
 def uncoloured(points: NDArray[np.float64]) -> Points:
-    """Return the finite ones of (P, 3) points, in grey."""
-    points = points[np.isfinite(points).all(axis=1)]
-    return points, np.full(points.shape, GREY, np.float32)
+    """Return the finite ones of (P, 3) points, which have no colours."""
+    return points[np.isfinite(points).all(axis=1)], None
 
 
 def read_ply(path: Path) -> Points:

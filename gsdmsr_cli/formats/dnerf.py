@@ -47,7 +47,7 @@ def read(folder: Path) -> Scene:
         layout="dnerf",
         views=tuple(views),
         points=np.zeros((0, 3), np.float32),
-        colours=np.zeros((0, 3), np.float32),
+        colours=None,
         duration=None,
         bound=BOUND,
         fingerprint=checks.fingerprint(paths.values()),

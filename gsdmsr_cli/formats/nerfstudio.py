@@ -10,9 +10,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from gsdmsr_cli.errors import DataError
 from gsdmsr_cli.formats import _checks as checks
 from gsdmsr_cli.formats import _points, _world
@@ -120,9 +117,7 @@ def _mask(folder: Path, fields: dict[str, Any], key: str, view: View, where: str
     return mask
 
 
-def _read_points(
-    folder: Path, document: dict[str, Any], path: Path
-) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
+def _read_points(folder: Path, document: dict[str, Any], path: Path) -> _points.Points:
     name = document.get("ply_file_path")
     if name is None:
         return _points.none()

@@ -9,12 +9,14 @@ from torch import Tensor
 
 from gsdmsr_cli.fields.planes import Box, Corner
 from gsdmsr_cli.geometry import SH_C0
+from gsdmsr_cli.kernels.neighbours import mean_squares
 from gsdmsr_cli.motion import Facts
 from gsdmsr_cli.pictures import Pictures
 from gsdmsr_cli.preset import SplatOptions
 from gsdmsr_cli.scene import Scene
 from gsdmsr_cli.splats import Splats
-from gsdmsr_cli.training.silhouettes import sample_points
+from gsdmsr_cli.training import silhouettes, surfaces
+from gsdmsr_cli.training.sightings import colours_of
 
 NEIGHBOURS = 3
 
@@ -32,13 +34,21 @@ def initial_splats(
 ) -> Splats:
     """Return isotropic splats as large as the distance to their neighbours (3DGS, section 5.1).
 
-    They sit at the scene's own points, else at random in its box: evenly and nearly grey as all
-    methods do on D-NeRF, or where silhouettes overlap (see ``silhouettes``).
+    They sit at the scene's own points, coloured from the pictures if the format has no colours.
+    Without points ``options.start`` says where: at random in the box and nearly grey, as all
+    methods do on D-NeRF; where silhouettes overlap; or on surfaces, see the modules of these names.
     """
     if len(scene.points):
-        means, colours = torch.from_numpy(scene.points), torch.from_numpy(scene.colours)
+        means = torch.from_numpy(scene.points)
+        if scene.colours is None:
+            colours = colours_of(means, scene, pictures)
+        else:
+            colours = torch.from_numpy(scene.colours)
     elif options.start == "silhouettes":
-        means, colours = sample_points(scene, pictures, background, options.count, generator)
+        found = silhouettes.sample_points(scene, pictures, background, options.count, generator)
+        means, colours = found
+    elif options.start == "surfaces":
+        means, colours = surfaces.sample_points(scene, pictures, options.count, generator)
     else:
         means = (2 * torch.rand(options.count, 3, generator=generator) - 1) * scene.bound
         colours = 0.5 + SH_C0 * torch.rand(options.count, 3, generator=generator) / 255
@@ -61,12 +71,8 @@ def _spacing(means: Tensor, bound: float) -> Tensor:
     count = min(NEIGHBOURS, len(means) - 1)
     if count < 1:
         return torch.full((len(means),), 0.1 * bound)
-    squares = []
-    means = means - means.mean(dim=0)  # cdist multiplies, which cancels far from the origin
-    for chunk in means.split(1024):
-        nearest = torch.cdist(chunk, means).topk(count + 1, largest=False).values[:, 1:]
-        squares.append(nearest.square().mean(dim=1))
-    return torch.cat(squares).clamp(min=1e-7).sqrt()
+    squares = torch.from_numpy(mean_squares(means.double().numpy(), count))
+    return squares.clamp(min=1e-7).sqrt().float()
 
 
 def facts_of(scene: Scene, splats: Splats) -> Facts:

@@ -7,9 +7,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from gsdmsr_cli.camera import Camera
 from gsdmsr_cli.pictures import Pictures
 from gsdmsr_cli.scene import Scene
+from gsdmsr_cli.training.sightings import places
 
 CANDIDATES, MOST_CANDIDATES = 20, 500_000
 """Random points per point wanted, and how many at most, for the sake of memory."""
@@ -65,7 +65,9 @@ def sample_points(
         stride = max(1, min(picture.shape[1:]) // GRID)
         pixels = picture[:, ::stride, ::stride].permute(1, 2, 0).float()
         drawn = (pixels - plain).abs().amax(dim=2) > DIFFERENCE
-        visible, row, column = _pixels_of(candidates, camera, stride, drawn.shape)
+        across, down, visible = places(candidates, camera)
+        column = (across / stride).long().clamp(0, drawn.shape[1] - 1)
+        row = (down / stride).long().clamp(0, drawn.shape[0] - 1)
         hit = visible & drawn[row, column]
         seen += visible
         inside += hit
@@ -78,16 +80,3 @@ def sample_points(
     means = means.clamp(-scene.bound, scene.bound)
     mean_colours = colours / inside.clamp(min=1)[:, None]
     return Points(means, torch.where(inside[rows, None] > 0, mean_colours[rows], 0.5))
-
-
-def _pixels_of(
-    points: Tensor, camera: Camera, stride: int, size: torch.Size
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Return which points (P, 3) the picture shows, and the row and column they fall on."""
-    rotation = torch.as_tensor(camera.rotation, dtype=points.dtype)
-    at = points @ rotation.T + torch.as_tensor(camera.translation, dtype=points.dtype)
-    depth = at[:, 2].clamp(min=1e-6)
-    column = ((at[:, 0] / depth * camera.fx + camera.cx) / stride).floor().long()
-    row = ((at[:, 1] / depth * camera.fy + camera.cy) / stride).floor().long()
-    visible = (at[:, 2] > 0) & (row >= 0) & (row < size[0]) & (column >= 0) & (column < size[1])
-    return visible, row.clamp(0, size[0] - 1), column.clamp(0, size[1] - 1)

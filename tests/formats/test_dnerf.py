@@ -44,7 +44,7 @@ def test_a_scene_is_read(folder: Path) -> None:
     scene = read_scene(folder)
     assert scene.layout == "dnerf" and scene.root == folder
     assert [len(scene.split(s)) for s in ("train", "val", "test")] == [3, 2, 2]
-    assert scene.points.shape == scene.colours.shape == (0, 3)
+    assert scene.points.shape == (0, 3) and scene.colours is None
     assert scene.duration is None and scene.bound == 1.3
     assert scene.train_times == [0.0, 0.5, 1.0]
     view = scene.split("train")[1]

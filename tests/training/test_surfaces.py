@@ -1,0 +1,107 @@
+"""Points on surfaces, against a textured wall whose pictures are known in closed form."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from kernel_checks import generator
+from torch import Tensor
+
+from gsdmsr_cli.camera import Camera, look_at
+from gsdmsr_cli.pictures import Pictures
+from gsdmsr_cli.scene import Scene, View
+from gsdmsr_cli.training.sightings import colours_of, places
+from gsdmsr_cli.training.surfaces import sample_points
+
+WALL = 1.0
+"""The wall is the plane y = 1; cameras look at it from about y = -3."""
+
+
+def texture(x: np.ndarray, z: np.ndarray) -> np.ndarray:
+    waves = [np.sin(5 * x + 3 * z), np.cos(7 * z - 2 * x), np.sin(4 * x) * np.cos(6 * z)]
+    return 0.5 + 0.4 * np.stack(waves, axis=-1)
+
+
+def photograph(camera: Camera) -> Tensor:
+    columns, rows = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+    x, y = (columns - camera.cx) / camera.fx, (rows - camera.cy) / camera.fy
+    rays = np.stack([x, y, np.ones_like(x)], -1) @ camera.rotation
+    at = camera.centre + rays * ((WALL - camera.centre[1]) / rays[..., 1])[..., None]
+    picture = (255 * texture(at[..., 0], at[..., 2])).round().astype(np.uint8)
+    return torch.from_numpy(picture).permute(2, 0, 1).contiguous()
+
+
+class Album(Pictures):
+    def __init__(self, pictures: list[Tensor]) -> None:
+        super().__init__((1.0, 1.0, 1.0), 1, 0)
+        self.pictures = pictures
+
+    def load(self, view: View) -> Tensor:
+        return self.pictures[int(view.name)]
+
+
+def capture(count: int) -> tuple[Scene, Album]:
+    shots = []
+    for i in range(count):
+        centre = np.array([-1 + 2 * i / max(count - 1, 1), -3.0, 0.4 * np.sin(2.5 * i)])
+        pose = look_at(centre, np.array([0.0, WALL, 0]), np.array([0.0, 0.0, 1.0]))
+        shots.append(Camera(pose, 90.0, 90.0, 48.0, 40.0, 96, 80))
+    views = tuple(
+        View(str(i), shot, i / max(count - 1, 1), "train", Path()) for i, shot in enumerate(shots)
+    )
+    nothing = np.zeros((0, 3), np.float32)
+    scene = Scene(Path(), "test", views, nothing, None, None, 3.0, "")
+    return scene, Album([photograph(shot) for shot in shots])
+
+
+def test_points_lie_on_the_wall_in_its_colours() -> None:
+    scene, pictures = capture(12)
+    points = sample_points(scene, pictures, 600, generator(0))
+    assert points.means.shape == points.colours.shape == (600, 3)
+    off = (points.means[:, 1] - WALL).abs()
+    # depths about the best of the first ones are, 4 away, 4^2 (1 / 0.5 - 1 / 6.1) / 40 * 2 / 11 =
+    # 0.13 apart, so half of that is the most that is lost by trying only some
+    assert off.median() < 0.07 and (off < 0.25).float().mean() > 0.85
+    on_wall = off < 0.1
+    expected = texture(points.means[on_wall, 0].numpy(), points.means[on_wall, 2].numpy())
+    assert on_wall.sum() > 200
+    assert np.abs(points.colours[on_wall].numpy() - expected).mean() < 0.04
+
+
+def test_a_single_view_has_rays_but_no_depths() -> None:
+    scene, pictures = capture(1)
+    points = sample_points(scene, pictures, 200, generator(0))
+    column, row, shown = places(points.means, scene.views[0].camera)
+    assert shown.all() and points.means.isfinite().all()
+    pixels = pictures.load(scene.views[0])[:, row.long(), column.long()].T / 255
+    assert (points.colours - pixels).abs().mean() < 0.05
+    assert points.means.norm(dim=1).std() > 0.1
+
+
+def test_the_seed_decides() -> None:
+    scene, pictures = capture(5)
+    one, same, other = (sample_points(scene, pictures, 50, generator(s)).means for s in (1, 1, 2))
+    assert torch.equal(one, same) and not torch.equal(one, other)
+
+
+def test_colours_are_the_mean_of_what_views_show() -> None:
+    scene, pictures = capture(6)
+    x, z = np.meshgrid(np.linspace(-0.5, 0.5, 7), np.linspace(-0.5, 0.5, 7))
+    wall = np.stack([x.ravel(), np.full(x.size, WALL), z.ravel()], axis=1).astype(np.float32)
+    hidden = np.array([[0, -9.0, 0]], np.float32)  # behind all cameras
+    found = colours_of(torch.from_numpy(np.concatenate([wall, hidden])), scene, pictures)
+    # a pixel is 4 / 90 of a unit wide, over which the texture changes by at most 0.4 * 8 * 0.022
+    assert np.abs(found[:-1].numpy() - texture(wall[:, 0], wall[:, 2])).max() < 0.08
+    assert found[-1].tolist() == [0.5] * 3
+
+
+@pytest.mark.parametrize("shift", [0.0, 0.49, -0.49])
+def test_places_are_pixels(shift: float) -> None:
+    camera = Camera(np.eye(4), 10.0, 20.0, 4.0, 3.0, 8, 6)
+    points = torch.tensor([[0.1, 0.05, 1.0], [0.2 + shift, 0, 2.0], [0, 0, -1.0], [-1.0, 0, 1.0]])
+    column, row, shown = places(points, camera)
+    assert column[:2].tolist() == pytest.approx([5, 4 + 10 * (0.2 + shift) / 2])
+    assert row[0].item() == pytest.approx(4) and shown.tolist() == [True, True, False, False]
