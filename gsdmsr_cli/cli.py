@@ -212,19 +212,44 @@ def evaluate(
         bool, typer.Option("--lpips-inria", help="LPIPS on [0, 1] too, as in tables after 3DGS.")
     ] = False,
     as_json: Json = False,
+    out: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Folder to write, if not RUN/eval.")
+    ] = None,
     fail_under: Annotated[
         list[str] | None,
-        typer.Option(metavar="METRIC=VALUE", help="Exit with 4 if worse; repeatable."),
+        typer.Option(metavar="METRIC=VALUE", help="Exit with 4 if it is less; repeatable."),
     ] = None,
+    fail_over: Annotated[
+        list[str] | None,
+        typer.Option(metavar="METRIC=VALUE", help="Exit with 4 if it is more; repeatable."),
+    ] = None,
+    baseline: Annotated[
+        Path | None,
+        typer.Option(metavar="F.json", help="Exit with 4 if worse than this metrics.json."),
+    ] = None,
+    tolerance: Annotated[
+        list[str] | None,
+        typer.Option(metavar="METRIC=VALUE", help="How much worse it may be; repeatable."),
+    ] = None,
+    junit: Annotated[
+        Path | None, typer.Option(metavar="F.xml", help="Write what passed as JUnit XML.")
+    ] = None,
+    github_summary: Annotated[
+        bool, typer.Option("--github-summary", help="Append to the summary of GitHub Actions.")
+    ] = False,
     data: MovedData = None,
 ) -> None:
     """Measure a run on views it has not seen."""
-    from gsdmsr_cli.evaluation.request import Request
+    from gsdmsr_cli.evaluation.request import Demands, Output, Request
 
     request = Request(split, background, downscale, lpips_weights, lpips_inria)
+    demands = Demands(
+        tuple(fail_under or ()), tuple(fail_over or ()), baseline, tuple(tolerance or ())
+    )
+    output = Output(out, as_json, junit, github_summary)
     from gsdmsr_cli.commands import eval as command
 
-    command.run(run_folder, request, as_json, fail_under or [], data)
+    command.run(run_folder, request, demands, output, data)
 
 
 @app.command()

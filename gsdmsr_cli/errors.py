@@ -25,7 +25,7 @@ class DataError(GsdmsrError):
 
 
 class ThresholdError(GsdmsrError):
-    """A measured value misses a threshold given with ``--fail-under``."""
+    """A measured value misses a threshold, or is worse than a baseline allows."""
 
     exit_code = 4
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import uuid
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
@@ -48,10 +49,32 @@ def write_json(path: Path, document: Mapping[str, Any]) -> None:
         DataError: the file cannot be written.
         ValueError: the document holds NaN or infinity, which JSON does not have.
     """
-    text = json.dumps(document, indent=2, allow_nan=False) + "\n"
+    write_text(path, json.dumps(document, indent=2, allow_nan=False) + "\n")
+
+
+def write_text(path: Path, text: str) -> None:
+    """Replace ``path`` by the text; its folder is made.
+
+    Raises:
+        DataError: the file cannot be written.
+    """
     with replacing(path) as beside:
         path.parent.mkdir(parents=True, exist_ok=True)
         beside.write_text(text, encoding="utf-8")
+
+
+def require_folder(path: Path) -> None:
+    """Make the folder ``path`` unless it is there, so that work for it is not done in vain.
+
+    Raises:
+        DataError: it cannot be made, or nothing can be written there.
+    """
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise DataError(f"{path}: cannot be made: {error.strerror or error}") from error
+    if not os.access(path, os.W_OK | os.X_OK):
+        raise DataError(f"{path}: cannot be written; choose another folder or change its rights")
 
 
 def read_json(path: Path) -> dict[str, Any]:

@@ -16,6 +16,7 @@ import typer
 from gsdmsr_cli import __version__, cli, commands
 from gsdmsr_cli.benchmark.trials import Terms
 from gsdmsr_cli.errors import DataError, GsdmsrError, ThresholdError, UsageError
+from gsdmsr_cli.evaluation.request import Demands, Output
 from gsdmsr_cli.evaluation.request import Request as Evaluation
 from gsdmsr_cli.filming.request import Request
 from gsdmsr_cli.preset import load_preset
@@ -99,16 +100,20 @@ def test_version(gsdmsr: Gsdmsr, capsys: pytest.CaptureFixture[str]) -> None:
             "train",
             (Path("d"), Path("r"), "dnerf", Path("f.yaml"), ["a.b=1", "a.c=2"], "cpu", True, False),
         ),
-        ("eval r", "eval", (Path("r"), Evaluation(), False, [], None)),
+        ("eval r", "eval", (Path("r"), Evaluation(), Demands(), Output(), None)),
         (
             "eval r --split val --background both --downscale 2 --lpips-weights w --lpips-inria"
-            " --json --fail-under psnr=25 --fail-under ssim=0.9 --data d",
+            " --json --fail-under psnr=25 --fail-under ssim=0.9 --fail-over lpips_alex=0.1"
+            " --baseline b.json --tolerance psnr=0.5 --junit j.xml --github-summary --out o"
+            " --data d",
             "eval",
             (
                 Path("r"),
                 Evaluation("val", "both", 2, Path("w"), True),
-                True,
-                ["psnr=25", "ssim=0.9"],
+                Demands(
+                    ("psnr=25", "ssim=0.9"), ("lpips_alex=0.1",), Path("b.json"), ("psnr=0.5",)
+                ),
+                Output(Path("o"), True, Path("j.xml"), True),
                 Path("d"),
             ),
         ),

@@ -39,7 +39,7 @@ def measure(trained: Trained, request: Request) -> dict[str, Any]:
     cameras = [studio.pictures.camera(view) for view in views]
     sizes = [(camera.width, camera.height) for camera in cameras]
     metrics = load_metrics(min(sizes, key=min), request.lpips_weights, request.lpips_inria)
-    first, *others = _backgrounds(trained, request)
+    _, *others = _backgrounds(trained, request)
     chosen = _views_by_split(trained, request.split)
     work: list[_Sitting] = [
         (split, studio, own, metrics if split == request.split else {})
@@ -51,7 +51,7 @@ def measure(trained: Trained, request: Request) -> dict[str, Any]:
     speed = measure_speed(studio.model, shots, studio.engine, studio.background)
     return {
         "schema": SCHEMA,
-        "protocol": _protocol(trained, request, first, sizes[0]),
+        "protocol": describe(trained, request),
         **_results(scored[request.split], metrics),
         "splits": {
             split: {"psnr": _mean(scored[split])["psnr"], "frames": len(own)}
@@ -101,15 +101,20 @@ def _evenly(views: Sequence[View], count: int) -> list[View]:
     return [views[i * len(views) // count] for i in range(count)]
 
 
-def _protocol(
-    trained: Trained, request: Request, background: str, resolution: tuple[int, int]
-) -> dict[str, Any]:
+def describe(trained: Trained, request: Request) -> dict[str, Any]:
+    """Return the document's ``protocol``, which is known before anything is measured.
+
+    Raises:
+        DataError: the split has no views.
+        UsageError: the pictures are too small for the downscale.
+    """
     options, checkpoint = trained.run.preset, trained.checkpoint
+    camera = trained.studio.pictures.camera(trained.scene.split(request.split)[0])
     return {
         "split": request.split,
-        "resolution": list(resolution),
+        "resolution": [camera.width, camera.height],
         "downscale": request.downscale or options.data.downscale,
-        "background": background,
+        "background": _backgrounds(trained, request)[0],
         "checkpoint": "last",
         "checkpoint_step": checkpoint.step,
         "progress": checkpoint.progress,

@@ -14,7 +14,7 @@ from rich.table import Table
 from gsdmsr_cli.benchmark.curves import charts_of
 from gsdmsr_cli.benchmark.scoreboard import HEADS, TEXTS, cells, markdown, rows_of
 from gsdmsr_cli.benchmark.trials import Terms, all_trials, run_trial
-from gsdmsr_cli.files import replacing, write_json
+from gsdmsr_cli.files import write_json, write_text
 from gsdmsr_cli.formats import read_scene
 
 SCHEMA = 1
@@ -54,7 +54,7 @@ def run(
         rows = rows_of(scored)
         _write(out, rows, terms)
         for name, chart in charts_of([trial for trial, _ in scored], out).items():
-            _write_text(out / f"psnr-{name}.svg", chart)
+            write_text(out / f"psnr-{name}.svg", chart)
     if as_json:
         sys.stdout.write(json.dumps(_document(rows, terms)) + "\n")
     else:
@@ -73,12 +73,7 @@ def _document(rows: Sequence[dict[str, Any]], terms: Terms) -> dict[str, Any]:
 
 def _write(out: Path, rows: Sequence[dict[str, Any]], terms: Terms) -> None:
     write_json(out / "table.json", _document(rows, terms))
-    _write_text(out / "table.md", markdown(rows))
-
-
-def _write_text(path: Path, text: str) -> None:
-    with replacing(path) as beside:
-        beside.write_text(text, encoding="utf-8")
+    write_text(out / "table.md", markdown(rows))
 
 
 def _table(rows: Sequence[dict[str, Any]], terms: Terms) -> Table:

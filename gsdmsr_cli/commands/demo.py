@@ -11,7 +11,6 @@ from gsdmsr_cli.commands import eval as evaluate
 from gsdmsr_cli.commands import render, train
 from gsdmsr_cli.commands._progress import progress_bar
 from gsdmsr_cli.errors import DataError, UsageError
-from gsdmsr_cli.evaluation import request as evaluation
 from gsdmsr_cli.filming.request import Request
 from gsdmsr_cli.synthetic import write_scene
 
@@ -34,7 +33,7 @@ def run(out: Path) -> None:
     _write_scene(scene)
     overrides = [f"training.budget={BUDGET}"]
     train.run(scene, run_folder, "dnerf", None, overrides, "auto", False, run_folder.exists())
-    evaluate.run(run_folder, evaluation.Request())
+    evaluate.run(run_folder)
     render.run(run_folder, Request(), None)
     Console().out(_where_to_look(scene, run_folder), highlight=False)
 

@@ -163,13 +163,6 @@ def _explained(value: float | None, metric: Metric | Missing) -> dict[str, Any]:
     return {"value": value, "reason": reason, "searched": []}
 
 
-def value_of(aggregate: Mapping[str, Any], metric: str) -> float | None:
-    """Return the number that a report's aggregate has for a metric, or None."""
-    entry = aggregate.get(metric)
-    value: float | None = entry["value"] if isinstance(entry, Mapping) else entry
-    return value
-
-
 def storage(tensors: Mapping[str, Tensor]) -> dict[str, int]:
     """Return the bytes of a checkpoint's tensors: splats, motion, and what training adds."""
     sizes = {"splats_bytes": 0, "motion_bytes": 0, "training_state_bytes": 0}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -26,3 +27,37 @@ class Request:
     downscale: int | None = None
     lpips_weights: Path | None = None
     lpips_inria: bool = False
+
+
+@dataclass(frozen=True)
+class Demands:
+    """What must hold of the figures, as given on the command line.
+
+    Attributes:
+        fail_under: "metric=value", the least of metrics of which more is better.
+        fail_over: "metric=value", the most of distances.
+        baseline: an earlier ``metrics.json`` to compare with.
+        tolerance: "metric=value", how much worse than the baseline a metric may be.
+    """
+
+    fail_under: Sequence[str] = ()
+    fail_over: Sequence[str] = ()
+    baseline: Path | None = None
+    tolerance: Sequence[str] = ()
+
+
+@dataclass(frozen=True)
+class Output:
+    """Where the figures go besides ``metrics.json``.
+
+    Attributes:
+        folder: where to write, if not ``RUN/eval``.
+        as_json: whether stdout gets the document instead of a table.
+        junit: file of JUnit XML to write.
+        github_summary: whether to append Markdown to the file that GitHub Actions names.
+    """
+
+    folder: Path | None = None
+    as_json: bool = False
+    junit: Path | None = None
+    github_summary: bool = False

@@ -142,6 +142,14 @@ def test_a_document_that_cannot_be_written_leaves_nothing(tmp_path: Path) -> Non
     assert [path.name for path in tmp_path.iterdir()] == ["a.json"]
 
 
+def test_a_folder_without_leave_to_write_is_told(tmp_path: Path, monkeypatch: Any) -> None:
+    files.require_folder(tmp_path / "a" / "b")
+    assert (tmp_path / "a" / "b").is_dir()
+    monkeypatch.setattr(files.os, "access", lambda *_: False)  # root may write everywhere
+    with pytest.raises(DataError, match="b: cannot be written; choose another folder"):
+        files.require_folder(tmp_path / "a" / "b")
+
+
 def test_what_a_killed_training_was_writing_is_cleared_away(run: Run, tiny_scene: Path) -> None:
     for name in (".tmpAbc123", ".checkpoint.4f.part.safetensors", ".run.07.part.json"):
         (run.root / name).touch()
@@ -199,6 +207,34 @@ def test_eval_of_data_that_has_changed_is_refused(
     assert gsdmsr("eval", run.root, "--downscale", 49) == 2
     assert "allowed: 1 to 48" in one_line(capsys)
     assert not (run.root / "eval").exists()
+
+
+def test_eval_without_checkpoint_or_frames_or_room_is_one_line(
+    gsdmsr: Gsdmsr, run: Run, tiny_scene: Path, tmp_path: Path, capsys: Any
+) -> None:
+    (run.root / "eval").touch()
+    assert gsdmsr("eval", run.root) == 3
+    assert f"{run.root / 'eval'}: cannot be made: File exists" in one_line(capsys)
+    assert gsdmsr("eval", tmp_path) == 3
+    assert "not a run folder" in one_line(capsys)
+    run.checkpoint_path.unlink()
+    assert gsdmsr("eval", run.root) == 3
+    assert "the run has no checkpoint yet" in one_line(capsys)
+
+
+def test_a_split_without_frames_is_one_line(
+    gsdmsr: Gsdmsr, tiny_scene: Path, tmp_path: Path, capsys: Any
+) -> None:
+    there = shutil.copytree(tiny_scene, tmp_path / "there")
+    path = there / "transforms_val.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"frames": []}))
+    options = [part for option in FEW for part in ("--set", option)]
+    out = tmp_path / "run"
+    assert gsdmsr("train", "--data", there, "--out", out, "--steps", 1, *options) == 0
+    capsys.readouterr()
+    assert gsdmsr("eval", out, "--split", "val") == 3
+    assert "split 'val' has no frames; found train 12, test 4" in one_line(capsys)
+    assert not (out / "eval").exists()
 
 
 @pytest.mark.parametrize("part", ["below a file", "a file"])

@@ -233,13 +233,15 @@ def test_eval_takes_another_split_background_and_size(gsdmsr: Gsdmsr, run: Path)
     [
         ("psnr=60", "psnr is "),
         ("ssim=0.9999", "ssim is "),
+        ("ms_ssim=0.1", "ms_ssim has no value, wanted 0.1 or more"),
         ("lpips_vgg=0.3", "lpips_vgg has no value, wanted 0.3 or less"),
     ],
 )
 def test_a_missed_threshold_ends_with_4(
     gsdmsr: Gsdmsr, run: Path, threshold: str, message: str
 ) -> None:
-    ended = gsdmsr("eval", run, "--json", "--fail-under", "psnr=1", "--fail-under", threshold)
+    option = "--fail-over" if "lpips" in threshold else "--fail-under"
+    ended = gsdmsr("eval", run, "--json", "--fail-under", "psnr=1", option, threshold)
     assert ended.code == 4
     assert message in ended.err.splitlines()[-1]
     assert document_of(ended)["aggregate"]["psnr"] > 1  # the report is there all the same

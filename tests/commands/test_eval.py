@@ -7,6 +7,7 @@ import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import numba
 import numpy as np
@@ -16,6 +17,7 @@ from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 from torchmetrics.functional.image import multiscale_structural_similarity_index_measure
 
 from gsdmsr_cli import cli
+from gsdmsr_cli.commands import eval as evaluation
 from gsdmsr_cli.evaluation import speed
 from gsdmsr_cli.evaluation.lpips import Lpips, load_lpips
 from gsdmsr_cli.imaging import read_image
@@ -25,6 +27,8 @@ SIDE = 176
 """Of the pictures: the least for MS-SSIM."""
 
 Eval = Callable[..., dict[str, Any]]
+
+Refuse = Callable[..., str]
 
 
 def gsdmsr(*arguments: object) -> int:
@@ -70,6 +74,22 @@ def evaluate(run: Path, capsys: pytest.CaptureFixture[str], monkeypatch: Any) ->
         capsys.readouterr()
         assert gsdmsr("eval", run, "--json", *options) == 0
         return dict(json.loads(capsys.readouterr().out))
+
+    return call
+
+
+@pytest.fixture
+def refuse(run: Path, capsys: pytest.CaptureFixture[str], monkeypatch: Any) -> Refuse:
+    """Evaluates, expects an exit code and one line on stderr, and returns that line."""
+    monkeypatch.setenv("TORCH_HOME", str(run / "no weights"))
+    monkeypatch.delenv("GSDMSR_DEBUG", raising=False)
+
+    def call(code: int, *options: object, folder: Path = run) -> str:
+        capsys.readouterr()
+        assert gsdmsr("eval", folder, *options) == code
+        err = capsys.readouterr().err
+        assert err.startswith("error: ") and err.count("\n") == 1
+        return err
 
     return call
 
@@ -162,3 +182,51 @@ def test_lpips_on_both_ranges_with_real_weights(
         assert aggregate[name]["value"] == pytest.approx(mean, abs=1e-5)
     assert aggregate["lpips_vgg_inria"]["value"] is None
     assert "vgg.backbone.pth" in aggregate["lpips_vgg_inria"]["reason"]
+
+
+def test_gates_are_told_everywhere(
+    run: Path, refuse: Refuse, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told = tmp_path / "summary.md"
+    told.write_text("before\n")
+    monkeypatch.setenv("GITHUB_STEP_SUMMARY", str(told))
+    gates = "--fail-under", "psnr=1", "--fail-under", "ssim=0.9999", "--fail-over", "lpips_vgg=1"
+    error = refuse(4, *gates, "--junit", tmp_path / "j.xml", "--github-summary")
+    assert "ssim is " in error and "lpips_vgg has no value" in error and "psnr is" not in error
+    suite = ElementTree.parse(tmp_path / "j.xml").getroot()
+    assert (suite.get("tests"), suite.get("failures")) == ("3", "2")
+    text = told.read_text()
+    assert text.startswith("before\n## gsdmsr eval run\n") and text.count("**failed**") == 2
+
+
+def test_a_run_is_as_good_as_itself_and_not_as_good_as_a_better_one(
+    run: Path, evaluate: Eval, refuse: Refuse, tmp_path: Path
+) -> None:
+    document = evaluate("--out", tmp_path / "there")
+    path = tmp_path / "there" / "metrics.json"
+    assert json.loads(path.read_text()) == document
+    evaluate("--baseline", path)
+    document["aggregate"]["psnr"] += 1
+    better = tmp_path / "better.json"
+    better.write_text(json.dumps(document))
+    assert "wanted at most 0 worse" in refuse(4, "--baseline", better)
+    evaluate("--baseline", better, "--tolerance", "psnr=1.01")
+    error = refuse(3, "--baseline", better, "--downscale", 2)
+    assert "its resolution is 176 x 176, not 88 x 88 as here" in error
+    error = refuse(3, "--baseline", better, "--background", "black")
+    assert "its background is 'white', not 'black' as here" in error
+
+
+def test_wishes_that_cannot_be_met_are_refused_before_the_work(
+    run: Path, refuse: Refuse, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("GITHUB_STEP_SUMMARY", raising=False)
+    monkeypatch.setattr(evaluation, "measure", lambda *_: pytest.fail("it measures"))
+    (tmp_path / "file").touch()
+    assert "not a report" in refuse(3, "--baseline", run / "run.json")
+    assert "cannot be read" in refuse(3, "--baseline", tmp_path / "absent.json")
+    assert "GITHUB_STEP_SUMMARY is not set" in refuse(2, "--github-summary")
+    assert "--junit has nothing to tell" in refuse(2, "--junit", tmp_path / "j.xml")
+    assert "no such metric" in refuse(2, "--fail-over", "fid=3")
+    assert "use --fail-over" in refuse(2, "--fail-under", "lpips_alex=0.1")
+    assert "file/eval: cannot be made" in refuse(3, "--out", tmp_path / "file" / "eval")

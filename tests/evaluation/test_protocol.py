@@ -23,7 +23,6 @@ from gsdmsr_cli.evaluation.protocol import (
     score,
     score_views,
     storage,
-    value_of,
 )
 from gsdmsr_cli.fields.planes import CUBE
 from gsdmsr_cli.model import Model
@@ -87,12 +86,6 @@ def test_frames_that_do_not_name_a_metric_do_not_count_for_it() -> None:
     """A frame in which nothing moves says nothing of how well motion is met."""
     frames = [{"psnr": 20.0}, {"psnr": 30.0, "psnr_moving": 12.0}]
     assert average(frames) == {"psnr": 25.0, "psnr_moving": 12.0}
-
-
-def test_the_number_of_a_metric_is_found_in_every_form() -> None:
-    aggregate = {"psnr": 20.0, "ssim": None, "lpips_alex": {"value": 0.5, "reason": None}}
-    found = [value_of(aggregate, metric) for metric in ("psnr", "ssim", "lpips_alex", "ms_ssim")]
-    assert found == [20.0, None, 0.5, None]
 
 
 def test_parts_of_a_picture_are_scored_and_empty_ones_left_out() -> None:

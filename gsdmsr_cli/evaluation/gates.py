@@ -1,0 +1,170 @@
+"""What must hold of a report: bounds on its metrics, and nothing worse than an earlier report."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from gsdmsr_cli.errors import DataError, UsageError, nearest
+from gsdmsr_cli.evaluation.catalogue import METRICS, less_is_better
+from gsdmsr_cli.evaluation.request import Demands
+from gsdmsr_cli.evaluation.summary import value_of
+from gsdmsr_cli.files import read_json
+
+SAME = ("split", "resolution", "background", "data_fingerprint")
+"""What two reports must agree in for their figures to be comparable."""
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """Whether something holds that was asked for.
+
+    Attributes:
+        name: what was asked for, such as "psnr >= 25".
+        passed: whether it holds.
+        found: one clause that says what was found.
+    """
+
+    name: str
+    passed: bool
+    found: str
+
+
+@dataclass(frozen=True)
+class Bound:
+    """A value that a metric must reach, or, where less is better, must not exceed."""
+
+    metric: str
+    value: float
+
+    def judge(self, aggregate: Mapping[str, Any]) -> Verdict:
+        """Return the verdict on a report's aggregate; without a value nothing passes."""
+        value, less = value_of(aggregate, self.metric), less_is_better(self.metric)
+        name = f"{self.metric} {'<=' if less else '>='} {self.value:g}"
+        wanted = f"wanted {self.value:g} or {'less' if less else 'more'}"
+        if value is None:
+            return Verdict(name, False, f"{self.metric} has no value, {wanted}")
+        passed = value <= self.value if less else value >= self.value
+        return Verdict(name, passed, f"{self.metric} is {value:.6g}, {wanted}")
+
+
+@dataclass(frozen=True)
+class Baseline:
+    """An earlier report than which no metric may be worse.
+
+    Attributes:
+        path: where it was read.
+        document: the report.
+        tolerances: by metric, how much worse it may be. Without any, every metric that the
+            baseline has a number for must be as good.
+    """
+
+    path: Path
+    document: Mapping[str, Any]
+    tolerances: Mapping[str, float]
+
+    def require_same(self, protocol: Mapping[str, Any]) -> None:
+        """Raise DataError unless a report with this protocol can be compared with the baseline."""
+        earlier = self.document["protocol"]
+        own, other = (
+            {key: about.get(key) for key in SAME}
+            | {f"conventions.{key}": text for key, text in about.get("conventions", {}).items()}
+            for about in (protocol, earlier)
+        )
+        for key in own.keys() & other.keys():
+            if own[key] != other[key]:
+                raise DataError(
+                    f"{self.path}: its {key} is {_shown(other[key])}, not {_shown(own[key])} as "
+                    "here; a baseline must have been measured by the same protocol"
+                )
+
+    def judge(self, aggregate: Mapping[str, Any]) -> list[Verdict]:
+        """Return a verdict on every metric that is compared."""
+        earlier = self.document["aggregate"]
+        numbered = (metric for metric in METRICS if value_of(earlier, metric) is not None)
+        tolerances = self.tolerances or dict.fromkeys(numbered, 0.0)
+        return [self._judge(metric, t, aggregate) for metric, t in tolerances.items()]
+
+    def _judge(self, metric: str, tolerance: float, aggregate: Mapping[str, Any]) -> Verdict:
+        now, before = value_of(aggregate, metric), value_of(self.document["aggregate"], metric)
+        name = f"{metric} within {tolerance:g} of the baseline"
+        if now is None or before is None:
+            whose = "here" if now is None else "in the baseline"
+            return Verdict(name, False, f"{metric} has no value {whose}")
+        worse = now - before if less_is_better(metric) else before - now
+        found = f"{metric} is {now:.6g} after {before:.6g} in the baseline"
+        return Verdict(name, worse <= tolerance, f"{found}, wanted at most {tolerance:g} worse")
+
+
+@dataclass(frozen=True)
+class Gates:
+    """All that is asked of a report; nothing by default."""
+
+    bounds: Sequence[Bound] = ()
+    baseline: Baseline | None = None
+
+    def judge(self, document: Mapping[str, Any]) -> list[Verdict]:
+        """Return a verdict on everything that is asked for."""
+        aggregate = document["aggregate"]
+        verdicts = [bound.judge(aggregate) for bound in self.bounds]
+        return verdicts + (self.baseline.judge(aggregate) if self.baseline else [])
+
+
+def read_gates(demands: Demands) -> Gates:
+    """Return what the texts of the command line ask for.
+
+    Raises:
+        UsageError: a text names no metric or no number, or the metric is better the other way; or
+            there are tolerances without a baseline.
+        DataError: the baseline is not a report.
+    """
+    bounds = [_bound("--fail-under", text, less=False) for text in demands.fail_under]
+    bounds += [_bound("--fail-over", text, less=True) for text in demands.fail_over]
+    path = demands.baseline
+    if path is None:
+        if demands.tolerance:
+            raise UsageError(f"--tolerance {demands.tolerance[0]} needs a --baseline")
+        return Gates(bounds)
+    tolerances = dict(_number("--tolerance", text) for text in demands.tolerance)
+    for metric, value in tolerances.items():
+        if value < 0:
+            raise UsageError(f"--tolerance {metric}={value:g}: allowed: 0 or more")
+    return Gates(bounds, Baseline(path, _read_report(path), tolerances))
+
+
+def _bound(option: str, text: str, less: bool) -> Bound:
+    metric, value = _number(option, text)
+    if less_is_better(metric) != less:
+        better, other = ("more", "--fail-under") if less else ("less", "--fail-over")
+        raise UsageError(f"{option} {text}: {better} {metric} is better; use {other} {text}")
+    return Bound(metric, value)
+
+
+def _number(option: str, text: str) -> tuple[str, float]:
+    """Return the metric and the number of "metric=value"."""
+    metric, equals, value = text.partition("=")
+    if equals and metric not in METRICS:
+        raise UsageError(f"{option} {text}: no such metric; {nearest(metric, METRICS)}")
+    try:
+        number = float(value)
+    except ValueError:
+        number = math.nan
+    if not math.isfinite(number):
+        raise UsageError(f"{option} {text}: allowed: METRIC=NUMBER, as in psnr=25")
+    return metric, number
+
+
+def _read_report(path: Path) -> dict[str, Any]:
+    document = read_json(path)
+    if not all(isinstance(document.get(key), dict) for key in ("protocol", "aggregate")):
+        raise DataError(f"{path}: is not a report of eval; give a metrics.json that it has written")
+    return document
+
+
+def _shown(value: object) -> str:
+    if isinstance(value, list):
+        return " x ".join(map(str, value))
+    return f"'{value}'"

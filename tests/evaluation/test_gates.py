@@ -1,0 +1,131 @@
+"""What passes and what does not, and which baselines are none."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gsdmsr_cli.errors import DataError, UsageError
+from gsdmsr_cli.evaluation.gates import SAME, Bound, read_gates
+from gsdmsr_cli.evaluation.request import Demands
+
+PROTOCOL = {
+    "split": "test",
+    "resolution": [400, 400],
+    "background": "white",
+    "data_fingerprint": "abc",
+    "seed": 0,
+    "conventions": {"psnr": "of everything"},
+}
+
+
+def report(**aggregate: Any) -> dict[str, Any]:
+    return {"protocol": PROTOCOL, "aggregate": aggregate}
+
+
+def written(path: Path, document: Any) -> Path:
+    path.write_text(json.dumps(document))
+    return path
+
+
+def distance(value: float | None) -> dict[str, Any]:
+    return {"value": value, "reason": None, "searched": []}
+
+
+numbers = st.floats(-1e3, 1e3)
+
+
+@given(numbers, numbers)
+def test_a_bound_is_the_least_or_the_most_itself_included(value: float, bound: float) -> None:
+    assert Bound("psnr", bound).judge({"psnr": value}).passed == (value >= bound)
+    assert Bound("lpips_alex", bound).judge({"lpips_alex": distance(value)}).passed == (
+        value <= bound
+    )
+
+
+@pytest.mark.parametrize("aggregate", [{}, {"psnr": None}, {"psnr": distance(None)}])
+def test_what_has_no_value_passes_nothing(aggregate: dict[str, Any], tmp_path: Path) -> None:
+    verdict = Bound("psnr", -1e9).judge(aggregate)
+    assert not verdict.passed and "psnr has no value" in verdict.found
+    earlier = written(tmp_path / "a.json", report(psnr=1.0))
+    (verdict,) = read_gates(Demands(baseline=earlier)).judge({"aggregate": aggregate})
+    assert not verdict.passed and verdict.found == "psnr has no value here"
+    earlier = written(tmp_path / "a.json", report(**aggregate))
+    gates = read_gates(Demands(baseline=earlier, tolerance=("psnr=100",)))
+    (verdict,) = gates.judge(report(psnr=1e9))
+    assert not verdict.passed and verdict.found == "psnr has no value in the baseline"
+
+
+def test_without_tolerances_everything_must_be_as_good(tmp_path: Path) -> None:
+    earlier = report(psnr=25.0, ssim=0.9, lpips_alex=distance(0.1), lpips_vgg=distance(None))
+    gates = read_gates(Demands(baseline=written(tmp_path / "a.json", earlier)))
+    assert [v.passed for v in gates.judge(earlier)] == [True, True, True]
+    better = report(psnr=25.1, ssim=0.91, lpips_alex=distance(0.09))
+    assert [v.passed for v in gates.judge(better)] == [True, True, True]
+    worse = report(psnr=24.9, ssim=0.89, lpips_alex=distance(0.11))
+    assert [v.passed for v in gates.judge(worse)] == [False, False, False]
+    assert "psnr is 24.9 after 25 in the baseline" in gates.judge(worse)[0].found
+
+
+def test_with_tolerances_only_these_metrics_are_compared(tmp_path: Path) -> None:
+    earlier = written(tmp_path / "a.json", report(psnr=25.0, lpips_alex=distance(0.1), ssim=0.9))
+    demands = Demands(baseline=earlier, tolerance=("psnr=0.5", "lpips_alex=0.02"))
+    gates = read_gates(demands)
+    for psnr, lpips, passed in ((24.6, 0.115, True), (24.4, 0.125, False)):
+        verdicts = gates.judge(report(psnr=psnr, lpips_alex=distance(lpips), ssim=0.1))
+        assert [verdict.passed for verdict in verdicts] == [passed, passed]
+
+
+@pytest.mark.parametrize("key", SAME)
+def test_a_baseline_of_another_protocol_is_refused(key: str, tmp_path: Path) -> None:
+    gates = read_gates(Demands(baseline=written(tmp_path / "a.json", report(psnr=25.0))))
+    assert gates.baseline is not None
+    gates.baseline.require_same(PROTOCOL | {"seed": 5})
+    changed = {"resolution": [800, 800]}.get(key, "other")
+    with pytest.raises(DataError, match=f"its {key} is .*; a baseline must") as caught:
+        gates.baseline.require_same(PROTOCOL | {key: changed})
+    assert "\n" not in str(caught.value)
+
+
+def test_conventions_must_agree_where_both_state_them(tmp_path: Path) -> None:
+    gates = read_gates(Demands(baseline=written(tmp_path / "a.json", report(psnr=25.0))))
+    assert gates.baseline is not None
+    more = {"psnr": "of everything", "ms_ssim": "new"}
+    gates.baseline.require_same(PROTOCOL | {"conventions": more})
+    with pytest.raises(DataError, match=r"conventions\.psnr"):
+        gates.baseline.require_same(PROTOCOL | {"conventions": {"psnr": "of red alone"}})
+
+
+USAGE = {
+    "unknown": (Demands(fail_under=("pnsr=3",)), "--fail-under pnsr=3: no such metric; did you"),
+    "no number": (Demands(fail_over=("lpips_vgg=low",)), "allowed: METRIC=NUMBER"),
+    "infinite": (Demands(fail_under=("psnr=inf",)), "allowed: METRIC=NUMBER"),
+    "wrong way": (Demands(fail_under=("lpips_alex=1",)), "use --fail-over lpips_alex=1"),
+    "wrong way too": (Demands(fail_over=("psnr_moving=1",)), "use --fail-under psnr_moving=1"),
+    "no baseline": (Demands(tolerance=("psnr=1",)), "--tolerance psnr=1 needs a --baseline"),
+}
+
+
+@pytest.mark.parametrize(("demands", "message"), USAGE.values(), ids=USAGE)
+def test_demands_that_make_no_sense_are_refused(demands: Demands, message: str) -> None:
+    with pytest.raises(UsageError, match=message):
+        read_gates(demands)
+
+
+def test_a_tolerance_is_not_negative(tmp_path: Path) -> None:
+    earlier = written(tmp_path / "a.json", report(psnr=25.0))
+    with pytest.raises(UsageError, match="psnr=-1: allowed: 0 or more"):
+        read_gates(Demands(baseline=earlier, tolerance=("psnr=-1",)))
+
+
+@pytest.mark.parametrize("content", ["{", "[]", "{}", '{"protocol": {}, "aggregate": 3}'])
+def test_a_baseline_that_is_no_report_is_bad_data(content: str, tmp_path: Path) -> None:
+    (tmp_path / "a.json").write_text(content)
+    with pytest.raises(DataError, match=r"a\.json: ") as caught:
+        read_gates(Demands(baseline=tmp_path / "a.json"))
+    assert "\n" not in str(caught.value)
