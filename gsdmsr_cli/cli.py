@@ -358,6 +358,28 @@ def doctor(as_json: Json = False) -> None:
     command.run(as_json)
 
 
+@app.command()
+def weights(
+    fetch: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NET", help="Download what alex, squeeze or vgg lacks; repeatable."),
+    ] = None,
+    to: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Folder to download to, if not torch's.")
+    ] = None,
+    lpips_weights: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Folder to look in first.")
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Say which weights of LPIPS are here; download them if told to."""
+    if to is not None and not fetch:
+        raise UsageError("--to is where --fetch downloads to; give both or neither")
+    from gsdmsr_cli.commands import weights as command
+
+    command.run(fetch or [], to, lpips_weights, as_json)
+
+
 @benchmark_app.command()
 def kernels(
     yardstick: Annotated[

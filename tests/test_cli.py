@@ -22,7 +22,8 @@ from gsdmsr_cli.filming.request import Request
 from gsdmsr_cli.preset import load_preset
 
 COMMANDS = (
-    "train", "eval", "render", "export", "demo", "doctor", "benchmark_kernels", "benchmark_scenes",
+    "train", "eval", "render", "export", "demo", "doctor", "weights", "benchmark_kernels",
+    "benchmark_scenes",
 )  # fmt: skip
 
 
@@ -163,6 +164,12 @@ def test_version(gsdmsr: Gsdmsr, capsys: pytest.CaptureFixture[str]) -> None:
         ),
         ("demo", "demo", (Path("gsdmsr-demo"),)),
         ("doctor --json", "doctor", (True,)),
+        ("weights", "weights", ([], None, None, False)),
+        (
+            "weights --fetch vgg --fetch alex --to o --lpips-weights w --json",
+            "weights",
+            (["vgg", "alex"], Path("o"), Path("w"), True),
+        ),
         ("benchmark kernels --yardstick y --json", "benchmark_kernels", (Path("y"), True)),
         (
             "benchmark scenes a --out o --steps 9",
@@ -254,6 +261,7 @@ def test_a_budget_without_a_unit_is_refused_as_text(gsdmsr: Gsdmsr) -> None:
         ("benchmark scenes --out o --steps 3", "SCENE"),
         ("benchmark scenes a --out o", "--budget 8m or --steps N"),
         ("doctor extra", "extra"),
+        ("weights --to o", "--to is where --fetch downloads to"),
     ],
 )
 def test_usage_errors_are_one_line_and_exit_2(

@@ -33,7 +33,9 @@ from gsdmsr_cli.training.trainer import Trainer
 
 ROOT = Path(__file__).parent.parent
 PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").glob("*.md")])
-COMMANDS = ("prepare", "train", "eval", "render", "export", "demo", "doctor", "benchmark")
+COMMANDS = (
+    "prepare", "train", "eval", "render", "export", "demo", "doctor", "weights", "benchmark",
+)  # fmt: skip
 
 
 def example(page: str) -> str:

@@ -109,35 +109,62 @@ def load_lpips(net: str, folder: Path | None = None, device: str = "cpu") -> Lpi
         UsageError: there is no such network.
         DataError: ``folder`` is not a folder, or a weights file is not what its name says.
     """
-    if net not in ARCHITECTURES:
-        raise UsageError(f"unknown LPIPS network '{net}'; {nearest(net, NETS)}")
-    architecture = ARCHITECTURES[net]
-    folders = _folders(folder)
-    trunk_names = (f"{net}.backbone.pth", architecture.checkpoint)
-    linear_names = (f"linear/{net}.pth", f"{net}.pth", f"lpips_{net}.pth")
-    trunk_file, linear_file = _find(folders, trunk_names), _find(folders, linear_names)
-    if trunk_file is None or linear_file is None:
-        what, names = ("trunk", trunk_names) if trunk_file is None else ("linear", linear_names)
-        reason = f"no {what} weights of LPIPS '{net}': found none of {', '.join(names)}"
-        return Missing(reason, tuple(str(path) for path in folders))
-    weights = _load_linear(linear_file, architecture.channels)
+    trunk_file, linear_file = find_weights(net, folder).values()
+    if isinstance(trunk_file, Missing):
+        return trunk_file
+    if isinstance(linear_file, Missing):
+        return linear_file
+    weights = _load_linear(linear_file, ARCHITECTURES[net].channels)
     trunk = _load_trunk(trunk_file, net).to(device)
     return Lpips(net, trunk, [weight.to(device) for weight in weights])
 
 
-def _folders(folder: Path | None) -> list[Path]:
-    """Return the folders to search, in order."""
+def search_folders(folder: Path | None = None) -> list[Path]:
+    """Return the folders in which weights are looked for, in order.
+
+    Raises:
+        DataError: ``folder`` is not a folder.
+    """
     if folder is not None and not folder.is_dir():
         raise DataError(f"{folder} is not a folder; --lpips-weights names a folder of weights")
     named = os.environ.get(FOLDER_VARIABLE)
-    folders = [folder, Path(named) if named else None, Path(torch.hub.get_dir()) / "checkpoints"]
+    folders = [folder, Path(named) if named else None, hub_folder()]
     return [path for path in folders if path is not None]
 
 
-def _find(folders: list[Path], names: tuple[str, ...]) -> Path | None:
+def hub_folder() -> Path:
+    """Return the folder in which torch keeps weights."""
+    return Path(torch.hub.get_dir()) / "checkpoints"
+
+
+def find_weights(net: str, folder: Path | None = None) -> dict[str, Path | Missing]:
+    """Return the files of the "trunk" and the "linear" layers, or what was looked for.
+
+    Raises:
+        UsageError: there is no such network.
+        DataError: ``folder`` is not a folder.
+    """
+    if net not in ARCHITECTURES:
+        raise UsageError(f"unknown LPIPS network '{net}'; {nearest(net, NETS)}")
+    folders = search_folders(folder)
+    return {kind: _find(net, kind, names, folders) for kind, names in _names(net).items()}
+
+
+def _names(net: str) -> dict[str, tuple[str, ...]]:
+    """Return what either file may be called."""
+    return {
+        "trunk": (f"{net}.backbone.pth", ARCHITECTURES[net].checkpoint),
+        "linear": (f"linear/{net}.pth", f"{net}.pth", f"lpips_{net}.pth"),
+    }
+
+
+def _find(net: str, kind: str, names: tuple[str, ...], folders: list[Path]) -> Path | Missing:
     """Return the first of the named files that exists, folder by folder."""
-    paths = (folder / name for folder in folders for name in names)
-    return next((path for path in paths if path.is_file()), None)
+    for path in (folder / name for folder in folders for name in names):
+        if path.is_file():
+            return path
+    reason = f"no {kind} weights of LPIPS '{net}': found none of {', '.join(names)}"
+    return Missing(reason, tuple(map(str, folders)))
 
 
 def _load_trunk(path: Path, net: str) -> nn.Sequential:
