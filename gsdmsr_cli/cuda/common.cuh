@@ -1,7 +1,7 @@
 // What all kernels share: cameras, limits and small helpers.
 //
-// The compiler is given the constants of splatting (gsdmsr_cli/splatting_constants.py) and MOST_VIEWS
-// as macros. Tests compile the same sources with a host compiler, so nothing here needs a header.
+// The compiler is given the constants of splatting (gsdmsr_cli/splatting_constants.py) and the limits of
+// compiler.py as macros. Tests compile the same sources with a host compiler, so nothing here needs a header.
 #pragma once
 
 #define ALL_LANES 0xffffffffu

@@ -18,6 +18,12 @@ HERE = Path(__file__).parent
 MOST_VIEWS = 16
 """Views that one launch can draw: cameras are passed by value, as part of a kernel's arguments."""
 
+MOST_LEVELS = 8
+"""Levels of grids that one launch can look up."""
+
+MOST_TENSORS = 48
+"""Tensors that one launch can move."""
+
 OLDEST = 75
 """The oldest architecture that is compiled for and tested, sm_75 (Turing)."""
 
@@ -36,7 +42,10 @@ def definitions() -> dict[str, str]:
     """Return the macros that every source is compiled with."""
     values = {name: f"{getattr(constants, name)!r}f" for name in _CONSTANTS}
     values["LOG2_ALPHA_MIN"] = f"{math.log2(constants.ALPHA_MIN)!r}f"
-    return values | {"TILE": str(constants.TILE), "MOST_VIEWS": str(MOST_VIEWS)}
+    limits = {"MOST_VIEWS": MOST_VIEWS, "MOST_LEVELS": MOST_LEVELS, "MOST_TENSORS": MOST_TENSORS}
+    return values | {
+        name: str(limit) for name, limit in ({"TILE": constants.TILE} | limits).items()
+    }
 
 
 def target(nvrtc: Nvrtc, capability: int) -> tuple[str, str]:

@@ -35,11 +35,17 @@ runners: dict[str, Runner] = {}
 
 
 def launch(
-    source: str, kernel: str, grid: tuple[int, int], block: int, *arguments: Argument
+    source: str,
+    kernel: str,
+    grid: tuple[int, int],
+    block: int,
+    *arguments: Argument,
+    on: torch.device | None = None,
 ) -> None:
     """Launch ``kernel`` of ``source`` with a grid of blocks; nothing happens if the grid is empty.
 
-    The device is that of the tensors. Tensors in structures (``struct``) are the caller's to keep.
+    The device is that of the first tensor, unless it is given as ``on``. Tensors whose addresses
+    are in structures are the caller's to check and to keep.
 
     Raises:
         GsdmsrError: the program does not compile, or the driver refuses it.
@@ -49,12 +55,22 @@ def launch(
         return
     values = [_c_value(argument) for argument in arguments]
     addresses = (ctypes.c_void_p * len(values))(*map(ctypes.addressof, values))
-    device = next((a.device for a in arguments if isinstance(a, Tensor)), None)
+    device = on or next((a.device for a in arguments if isinstance(a, Tensor)), None)
     if device is None:
         raise ValueError(f"{kernel} was given no tensor")
     if device.type == "cuda" and "cuda" not in runners:
         runners["cuda"] = Driver()
     runners[device.type].launch(source, kernel, grid, block, addresses, device)
+
+
+def serves(*tensors: Tensor) -> bool:
+    """Tell whether kernels can run on these tensors: float32, on one kind of device with a runner.
+
+    Others go to the plain torch twin of each kernel, or to the kernels of the CPU.
+    """
+    kinds = {tensor.device.type for tensor in tensors}
+    there = kinds <= {"cuda", *runners} and len(kinds) == 1
+    return there and all(tensor.dtype is torch.float32 for tensor in tensors)
 
 
 def blocks(count: int, size: int) -> int:

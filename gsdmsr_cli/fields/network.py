@@ -66,8 +66,8 @@ def apply_network_twin(layers: Sequence[Layer], x: Tensor) -> Tensor:
     """Return what ``apply_network`` does, in plain torch, for any device and dtype."""
     x = x[:, : len(layers[0].weight)]
     for weight, bias in layers[:-1]:
-        x = torch.relu(x @ weight + bias)
-    return x @ layers[-1].weight + layers[-1].bias
+        x = torch.relu(torch.addmm(bias, x, weight))
+    return torch.addmm(layers[-1].bias, x, layers[-1].weight)
 
 
 class _Networks(Function):

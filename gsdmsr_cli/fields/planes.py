@@ -12,6 +12,8 @@ from torch import Tensor
 from torch.autograd import Function
 from torch.autograd.function import once_differentiable
 
+from gsdmsr_cli.cuda import grids
+from gsdmsr_cli.cuda.launch import serves
 from gsdmsr_cli.fields.live import live_rows, spread
 from gsdmsr_cli.kernels import planes as kernels
 from gsdmsr_cli.kernels.simd import LANES
@@ -77,6 +79,8 @@ def lookup(
     """
     tensors = [tensor for level in levels for tensor in level]
     own = points.new_empty(len(points), 0) if beside is None else beside
+    if serves(points, own, *tensors):
+        return grids.lookup(points, own, time, _to_cube(box).tolist(), tensors)
     if has_kernels(points, own, *tensors):
         features: Tensor = _Lookup.apply(points.contiguous(), own, time, box, *tensors)
         return features
@@ -178,6 +182,8 @@ def penalty(
     """
     tensors = [tensor for level in levels for tensor in level]
     weights = space_weight, smooth_weight, still_weight
+    if serves(*tensors):
+        return grids.penalty(weights, tensors)
     if has_kernels(*tensors):
         value: Tensor = _Penalty.apply(weights, *tensors)
         return value

@@ -9,6 +9,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gsdmsr_cli.cuda import adam as cuda
+from gsdmsr_cli.cuda.launch import serves
 from gsdmsr_cli.kernels import adam as kernels
 from gsdmsr_cli.tensors import has_kernels
 from gsdmsr_cli.training.state import below
@@ -79,6 +81,7 @@ class Adam:
                 where its tensor has no gradient.
         """
         by_kernel: list[Move] = []
+        by_cuda: list[Move] = []
         by_twin: list[Move] = []
         for name, tensor in tensors.items():
             if tensor.grad is None:
@@ -89,11 +92,12 @@ class Adam:
             self.steps[name] += 1
             moments = self.first[name], self.second[name]
             gradient = tensor.grad.contiguous()
-            moves = by_kernel if has_kernels(tensor) else by_twin
+            moves = by_cuda if serves(tensor) else by_kernel if has_kernels(tensor) else by_twin
             gate = (gates or {}).get(name)
             moves.append(Move(tensor, gradient, *moments, self.steps[name], rates[name], gate))
             tensor.grad = None
         adam_steps(by_kernel)
+        adam_steps_cuda(by_cuda)
         adam_steps_twin(by_twin)
 
     def take(self, names: Sequence[str], rows: Tensor, fresh: Tensor) -> None:
@@ -143,6 +147,16 @@ def adam_steps(moves: Sequence[Move]) -> None:
         table[i] = *addresses, tensor.numel(), width, *gates
         steps[i] = rate / (1 - BETA1**step), 1 / (1 - BETA2**step)
     kernels.adam(table, steps, *map(np.float32, (BETA1, BETA2, EPS)))
+
+
+def adam_steps_cuda(moves: Sequence[Move]) -> None:
+    """Make all the moves in place, by one CUDA kernel."""
+    rows = []
+    for tensor, gradient, first, second, step, rate, gate in moves:
+        factors = rate / (1 - BETA1**step), 1 / (1 - BETA2**step)
+        gates = (None, None) if gate is None else tuple(gate)
+        rows.append(cuda.Row(tensor, gradient, first, second, *factors, *gates))
+    cuda.adam(rows, BETA1, BETA2, EPS)
 
 
 def adam_steps_twin(moves: Sequence[Move]) -> None:

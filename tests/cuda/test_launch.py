@@ -68,3 +68,16 @@ def test_structures_have_the_layout_of_c() -> None:
 @pytest.mark.parametrize(("count", "expected"), [(0, 0), (1, 1), (256, 1), (257, 2)])
 def test_every_item_has_a_thread(count: int, expected: int) -> None:
     assert launch.blocks(count, 256) == expected
+
+
+def test_who_serves_whom() -> None:
+    here, there = torch.zeros(1), torch.zeros(1, device="meta")
+    assert not launch.serves(here)  # unless a test lends the CPU a runner
+    assert not launch.serves(there)
+
+
+def test_a_runner_serves_float32_on_its_own_device_alone(recorder: Recorder) -> None:
+    here, there = torch.zeros(1), torch.zeros(1, device="meta")
+    assert launch.serves(here, here)
+    assert not launch.serves(here.double())
+    assert not launch.serves(here, there)
