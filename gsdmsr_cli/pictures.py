@@ -145,7 +145,9 @@ class Pictures:
     def _decode_mask(self, view: View, path: Path) -> Tensor:
         """Return where a mask is white, or shows white in at least half of a shrunk pixel."""
         image = _read(view, path)
-        white = (image[..., : 3 if image.shape[2] > 3 else None].max(axis=2) > 127).astype("f4")
+        values = image[..., : 3 if image.shape[2] > 3 else None].max(axis=2)
+        # masks of 0 and 1 are common as well
+        white = (values > (127 if values.max() > 1 else 0)).astype(np.float32)
         if view.lens is not None:
             white = imaging.resample(white, *_sources(view.lens), sharply=False)
         if self._downscale > 1:

@@ -83,10 +83,13 @@ class Scene:
 
     @property
     def radius(self) -> float:
-        """Extent of the train cameras: 1.1 times the largest distance to their mean (3DGS)."""
+        """Extent of the train cameras: 1.1 times the largest distance to their mean (3DGS).
+
+        But at least ``bound``: cameras that hardly move may well look at something large.
+        """
         centres = np.stack([view.camera.centre for view in self.split("train")])
         spread = np.linalg.norm(centres - centres.mean(0), axis=1).max()
-        return float(1.1 * spread) if spread > 1e-6 else 1.0
+        return max(float(1.1 * spread), self.bound)
 
     @property
     def train_times(self) -> list[float]:

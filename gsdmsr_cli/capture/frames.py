@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 
 from gsdmsr_cli.capture.exif import Notes, read_notes, upright
 from gsdmsr_cli.capture.source import Source
-from gsdmsr_cli.capture.video import read_video, video_length
 from gsdmsr_cli.errors import DataError
 from gsdmsr_cli.files import read_json, write_json
 from gsdmsr_cli.imaging import read_image, write_png
 from gsdmsr_cli.native import cv2
+from gsdmsr_cli.video import read_video, video_length
 
 Picture = NDArray[np.uint8]
 Tell = Callable[[int, int], None]

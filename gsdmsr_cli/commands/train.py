@@ -63,7 +63,7 @@ def run(
         checkpoint = earlier.load()
         _require_rest(earlier, options, checkpoint)
     where = raster.pick_device(device)
-    scene, load_s = _timed(lambda: read_scene(data))
+    scene, load_s = _timed(lambda: _read(data))
     if earlier is not None:
         earlier.check_scene(scene)
     trainer, prepare_s = _timed(lambda: _prepare(scene, options, where))
@@ -85,6 +85,11 @@ def run(
     _say_end(folder, trainer, data, finished)
     if not finished:
         raise KeyboardInterrupt
+
+
+def _read(data: Path) -> Scene:
+    with progress_bar("decoding videos") as tell:
+        return read_scene(data, tell)
 
 
 def _prepare(scene: Scene, options: Preset, device: str) -> Trainer:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from itertools import islice
 from pathlib import Path
 
@@ -9,12 +10,21 @@ from gsdmsr_cli import plugins
 from gsdmsr_cli.errors import DataError
 from gsdmsr_cli.scene import Scene
 
+Tell = Callable[[int, int], None]
+"""Called with how much is done, and of how much."""
 
-def read_scene(folder: Path) -> Scene:
+
+def read_scene(folder: Path, tell: Tell = lambda done, total: None) -> Scene:
     """Read a data folder with the first format that recognises it.
 
     A format is a module of this package with ``SIGN: str``, the files that tell it, for messages;
     ``matches(folder: Path) -> bool``; and ``read(folder: Path) -> Scene``, which raises DataError.
+    It may have ``prepare(folder: Path, tell: Tell)``, which does what is to be done but once, such
+    as decoding videos.
+
+    Args:
+        folder: of the capture.
+        tell: told of the preparations, where there are any.
 
     Raises:
         DataError: there is no such folder, no format recognises it, or its content is unusable.
@@ -23,15 +33,17 @@ def read_scene(folder: Path) -> Scene:
         problem = "is a file, not a folder" if folder.exists() else "does not exist"
         raise DataError(f"data folder {folder} {problem}; give the folder of a capture")
     try:
-        return _read(folder)
+        return _read(folder, tell)
     except OSError as error:
         raise DataError(f"data folder {folder} cannot be read: {error}") from error
 
 
-def _read(folder: Path) -> Scene:
+def _read(folder: Path, tell: Tell) -> Scene:
     formats = [(name, plugins.load(__name__, name)) for name in plugins.names(__name__)]
     for _, module in formats:
         if module.matches(folder):
+            if hasattr(module, "prepare"):
+                module.prepare(folder, tell)
             scene: Scene = module.read(folder)
             return scene
     known = "; ".join(f"{name} ({module.SIGN})" for name, module in formats)

@@ -1,0 +1,164 @@
+"""The reader of Neural 3D Video, on small videos that the test encodes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from datasets import noise, write_picture
+
+from gsdmsr_cli.errors import DataError
+from gsdmsr_cli.formats import neural3d, read_scene
+from gsdmsr_cli.imaging import read_image
+from gsdmsr_cli.native import cv2
+
+CAMERAS, FRAMES = 3, 5
+WIDTH, HEIGHT = 64, 48
+
+
+def encode(path: Path, frames: int = FRAMES, width: int = WIDTH, height: int = HEIGHT) -> None:
+    """Write frames that get brighter, in the camera's own tint."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), 30.0, (width, height))
+    assert writer.isOpened()
+    for i in range(frames):
+        picture = np.full((height, width, 3), 40 * i + 20, np.uint8)
+        writer.write(picture)
+    writer.release()
+
+
+def row(i: int) -> list[float]:
+    """A camera at (i, 0, 0) that looks along world z, y down, as LLFF writes it."""
+    right, down, back = [1.0, 0, 0], [0, 1.0, 0], [0, 0, -1.0]
+    centre, size = [float(i), 0, 0], [HEIGHT, WIDTH, 60.0]
+    table = np.stack([down, right, back, centre, size], axis=1)  # columns
+    return [*table.ravel().tolist(), 1.0, 16.0]
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    folder = tmp_path / "scene"
+    for i in range(CAMERAS):
+        encode(folder / f"cam{i:02d}.mp4")
+    np.save(folder / "poses_bounds.npy", [row(i) for i in range(CAMERAS)])
+    return folder
+
+
+def test_a_rig_is_read_and_its_first_camera_is_for_testing(folder: Path) -> None:
+    told: list[tuple[int, int]] = []
+    scene = read_scene(folder, lambda done, total: told.append((done, total)))
+    assert scene.layout == "neural3d" and scene.duration == FRAMES / 30
+    assert told == [(i + 1, CAMERAS * FRAMES) for i in range(CAMERAS * FRAMES)]
+    assert [view.name for view in scene.split("test")] == [f"cam00_{i:04d}" for i in range(FRAMES)]
+    assert len(scene.split("train")) == 2 * FRAMES
+    assert scene.train_times == [i / 4 for i in range(FRAMES)]
+    for view in scene.views:
+        level = read_image(view.image_path).mean()
+        assert level == pytest.approx(160 * view.time + 20, abs=6)
+
+
+def test_cameras_are_llffs(folder: Path) -> None:
+    scene = read_scene(folder)
+    first, last = scene.views[0].camera, scene.views[-1].camera
+    np.testing.assert_allclose(first.rotation, np.eye(3), atol=1e-12)
+    assert (first.fx, first.fy, first.cx, first.cy) == (60, 60, 32, 24)
+    # parallel lines of sight: settled at the geometric mean of the depths, 4, which becomes 4
+    np.testing.assert_allclose(last.centre - first.centre, [2, 0, 0], atol=1e-12)
+    np.testing.assert_allclose([c.centre[2] for c in (first, last)], -4, atol=1e-12)
+
+
+def test_frames_are_decoded_once(folder: Path) -> None:
+    before = read_scene(folder)
+    stamps = [view.image_path.stat().st_mtime_ns for view in before.views]
+    told: list[int] = []
+    after = read_scene(folder, lambda done, total: told.append(done))
+    assert [view.image_path.stat().st_mtime_ns for view in after.views] == stamps and not told
+    for video in folder.glob("*.mp4"):
+        video.unlink()
+    assert len(read_scene(folder).views) == CAMERAS * FRAMES
+    assert before.fingerprint == after.fingerprint
+
+
+def test_wide_videos_are_halved(folder: Path) -> None:
+    for i in range(CAMERAS):
+        encode(folder / f"cam{i:02d}.mp4", frames=2, width=2048, height=1536)
+    camera = read_scene(folder).views[0].camera
+    assert (camera.width, camera.height) == (1024, 768)
+    assert camera.fx == pytest.approx(60 * 1024 / WIDTH)
+
+
+def test_an_interrupted_decoding_leaves_nothing_that_looks_finished(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write, written = neural3d.write_png, []
+
+    def interrupt(path: Path, picture: np.ndarray) -> None:
+        if len(written) == FRAMES + 2:
+            raise KeyboardInterrupt
+        written.append(path)
+        write(path, picture)
+
+    monkeypatch.setattr(neural3d, "write_png", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        read_scene(folder)
+    assert sorted(p.name for p in (folder / "cam00").iterdir()) == ["images"]
+    assert not list((folder / "cam01").iterdir())
+    stale = folder / "cam01" / ".images.123.part"  # as a killed process leaves it
+    stale.mkdir()
+    monkeypatch.setattr(neural3d, "write_png", write)
+    assert len(read_scene(folder).views) == CAMERAS * FRAMES
+    assert not stale.exists()
+
+
+def poses(change: Callable[[np.ndarray], Any]) -> Callable[[Path], Any]:
+    def spoil(folder: Path) -> None:
+        rows = np.array([row(i) for i in range(CAMERAS)])
+        result = change(rows)
+        np.save(folder / "poses_bounds.npy", rows if result is None else result)
+
+    return spoil
+
+
+def truncate(folder: Path) -> None:
+    path = folder / "cam01.mp4"
+    path.write_bytes(path.read_bytes()[:200])
+
+
+def stretch(rows: np.ndarray) -> None:
+    rows[:, :15] = rows[:, :15] * 2
+
+
+BAD: dict[str, tuple[Callable[[Path], Any], str]] = {
+    "torn poses": (lambda f: (f / "poses_bounds.npy").write_bytes(b"\x93NUMPY"), "is damaged"),
+    "other poses": (poses(lambda rows: rows[:, :16]), r"shape \(3, 16\)"),
+    "a pose too few": (poses(lambda rows: rows[:2]), "has 2 poses, but there are 3 cameras"),
+    "NaN": (poses(lambda rows: rows.__setitem__((0, 3), np.nan)), "holds NaN"),
+    "a depth of 0": (poses(lambda rows: rows.__setitem__((0, 15), 0)), "not above 0"),
+    "scaled": (poses(stretch), "is not a rigid pose: its rotation is scaled by 2"),
+    "another shape": (
+        poses(lambda rows: rows.__setitem__((slice(None), 4), 64)), "size is 64 x 64"),
+    "a torn video": (truncate, r"cam01\.mp4: no video stream"),
+    "another size": (lambda f: encode(f / "cam02.mp4", width=128, height=96), "must have one size"),
+    "an empty folder": (lambda f: (f / "cam02" / "images").mkdir(parents=True), "no PNG pictures"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("spoil", "message"), BAD.values(), ids=BAD.keys())
+def test_bad_input_is_refused_in_one_line(
+    folder: Path, spoil: Callable[[Path], Any], message: str
+) -> None:
+    spoil(folder)
+    with pytest.raises(DataError, match=message) as error:
+        read_scene(folder)
+    assert "\n" not in str(error.value) and str(folder) in str(error.value)
+
+
+def test_other_videos_are_no_cameras(tmp_path: Path) -> None:
+    np.save(tmp_path / "poses_bounds.npy", [row(0)])
+    encode(tmp_path / "camera.mp4")
+    write_picture(tmp_path / "images" / "a.png", noise(4, 4))
+    with pytest.raises(DataError, match="has no known layout"):
+        read_scene(tmp_path)
