@@ -171,6 +171,18 @@ class HalvedPictures:
         camera = self._pictures.camera(view)
         return camera.resized(max(1, camera.width // 2), max(1, camera.height // 2))
 
+    def counted(self, view: View) -> Tensor | None:
+        """Return which pixels count, (h, w) bool: those of which at least half does; None for all.
+
+        Made anew each time, which takes less than drawing the picture.
+        """
+        counted = self._pictures.counted(view)
+        if counted is None:
+            return None
+        camera = self.camera(view)
+        whole = counted.numpy().astype(np.float32)
+        return torch.from_numpy(imaging.resize_area(whole, camera.width, camera.height) >= 0.5)
+
     def load(self, view: View) -> Tensor:
         """Return the view's picture, (3, h, w) uint8, averaged by area."""
         key = view.split, view.name

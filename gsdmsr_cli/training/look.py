@@ -88,7 +88,7 @@ class Observer:
         splats = model.at(view.time, stage.teachers) if stage.moving else model.splats
         return compare(
             self.engine, model, splats, camera, self.background, target,
-            self._ssim_weight(stage.progress), degree, tile_weights,
+            self._ssim_weight(stage.progress), degree, tile_weights, pictures.counted(view),
         )  # fmt: skip
 
     def tiles(self, view: View, progress: float) -> int:
@@ -124,6 +124,7 @@ def compare(
     ssim_weight: float,
     sh_degree: int | None = None,
     tile_weights: Tensor | None = None,
+    counted: Tensor | None = None,
 ) -> Look:
     """Draw the model's splats and compare the picture with a target.
 
@@ -135,12 +136,13 @@ def compare(
         target, ssim_weight: see ``photometric_loss``.
         tile_weights: (tiles,) factors on the share of each tile in the loss, or None for 1
             everywhere; only where SSIM has no weight.
+        counted: (H, W) bool, pixels that have a part in the loss, or None for all.
     """
     given = splats, camera, background, target, ssim_weight, sh_degree, tile_weights
-    if isinstance(engine, Comparing):
+    if counted is None and isinstance(engine, Comparing):
         found = engine.compare(*given)
     else:
-        found = draw_and_compare(engine, *given)
+        found = draw_and_compare(engine, *given, counted)
     tensors = list(model.tensors().values())
     gradients = torch.autograd.grad(found.loss, tensors, allow_unused=True)
     size = camera.width, camera.height
@@ -156,15 +158,23 @@ def draw_and_compare(
     ssim_weight: float,
     sh_degree: int | None = None,
     tile_weights: Tensor | None = None,
+    counted: Tensor | None = None,
 ) -> Comparison:
-    """Do what ``Engine.compare`` does with an engine that can only draw."""
+    """Do what ``Engine.compare`` does with an engine that can only draw.
+
+    Pixels that do not count are taken for right, also by the windows of SSIM.
+    """
     frame = engine.rasterize(splats, camera, background, sh_degree)
-    errors = None if ssim_weight > 0 else tile_errors(frame.rgb, target)
+    rgb = frame.rgb
+    if counted is not None:
+        true = target.permute(1, 2, 0).to(rgb) / 255
+        rgb = torch.where(counted.to(rgb.device)[..., None], rgb, true)
+    errors = None if ssim_weight > 0 else tile_errors(rgb, target)
     if errors is None or tile_weights is None:
-        loss = unweighted = photometric_loss(frame.rgb, target, ssim_weight)
+        loss = unweighted = photometric_loss(rgb, target, ssim_weight)
     else:
         errors = errors * (tile_weights > 0)
-        loss = ((errors * tile_weights).sum() / target.numel()).to(frame.rgb.dtype)
+        loss = ((errors * tile_weights).sum() / target.numel()).to(rgb.dtype)
         unweighted = errors.sum() / target.numel()
     (on_screen,) = torch.autograd.grad(unweighted, frame.means2d, retain_graph=True)
     return Comparison(loss, on_screen, None if errors is None else errors.detach())
