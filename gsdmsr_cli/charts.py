@@ -9,7 +9,7 @@ from itertools import cycle
 from xml.sax.saxutils import escape, quoteattr
 
 WIDTH, HEIGHT = 720, 400
-_LEFT, _RIGHT, _TOP, _BOTTOM = 56, 16, 64, 48
+_LEFT, _RIGHT, _TOP, _BOTTOM = 56, 16, 78, 48
 _TICKS = 6
 
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#999999")
@@ -30,36 +30,50 @@ class Line:
     Attributes:
         name: what it stands for; lines of one name share a colour and an entry of the legend.
         points: (x, y) in the order of x.
+        labels: of the points, which are then drawn as dots that show them under the mouse.
     """
 
     name: str
     points: Sequence[tuple[float, float]]
+    labels: Sequence[str] = ()
 
 
-def line_chart(title: str, x_label: str, y_label: str, lines: Iterable[Line]) -> str:
-    """Return an SVG of all lines with at least two points, and axes that fit them."""
+def line_chart(
+    title: str,
+    x_label: str,
+    y_label: str,
+    lines: Iterable[Line],
+    size: tuple[int, int] = (WIDTH, HEIGHT),
+) -> str:
+    """Return an SVG of all lines with at least two points, and axes that fit them.
+
+    Its text is 13 units high, of which ``size`` (width, height) has so many.
+    """
+    width, height = size
     drawn = [line for line in lines if len(line.points) > 1]
     x_ticks = _ticks([x for line in drawn for x, _ in line.points])
     y_ticks = _ticks([y for line in drawn for _, y in line.points])
-    across = _scale(x_ticks, _LEFT, WIDTH - _RIGHT)
-    up = _scale(y_ticks, HEIGHT - _BOTTOM, _TOP)
+    across = _scale(x_ticks, _LEFT, width - _RIGHT)
+    up = _scale(y_ticks, height - _BOTTOM, _TOP)
     colours = dict(zip(dict.fromkeys(line.name for line in drawn), cycle(COLOURS), strict=False))
     parts = [
-        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {WIDTH} {HEIGHT}" role="img"'
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {height}" role="img"'
         f" aria-label={quoteattr(title)}><style>{_STYLE}</style>",
         _text(_LEFT, 22, title, weight="bold"),
-        _text((_LEFT + WIDTH - _RIGHT) / 2, HEIGHT - 10, x_label, anchor="middle"),
-        _text(8, _TOP - 12, y_label),
+        _text((_LEFT + width - _RIGHT) / 2, height - 10, x_label, anchor="middle"),
+        _text(8, _TOP - 14, y_label),
     ]
     for tick in x_ticks:
-        parts.append(_rule(across(tick), HEIGHT - _BOTTOM, across(tick), _TOP))
-        parts.append(_text(across(tick), HEIGHT - _BOTTOM + 18, f"{tick:g}", anchor="middle"))
+        parts.append(_rule(across(tick), height - _BOTTOM, across(tick), _TOP))
+        parts.append(_text(across(tick), height - _BOTTOM + 18, f"{tick:g}", anchor="middle"))
     for tick in y_ticks:
-        parts.append(_rule(_LEFT, up(tick), WIDTH - _RIGHT, up(tick)))
+        parts.append(_rule(_LEFT, up(tick), width - _RIGHT, up(tick)))
         parts.append(_text(_LEFT - 8, up(tick) + 4, f"{tick:g}", anchor="end"))
     for line in drawn:
         places = " ".join(f"{across(x):.1f},{up(y):.1f}" for x, y in line.points)
         parts.append(f'<path stroke="{colours[line.name]}" d="M{places}"/>')
+        for (x, y), label in zip(line.points, line.labels, strict=False):
+            parts.append(_dot(across(x), up(y), colours[line.name], label))
     at = float(_LEFT)
     for name, colour in colours.items():
         parts.append(f'<circle cx="{at + 5:.0f}" cy="39" r="5" fill="{colour}"/>')
@@ -87,6 +101,11 @@ def _scale(ticks: Sequence[float], low: float, high: float) -> Callable[[float],
 
 def _rule(x1: float, y1: float, x2: float, y2: float) -> str:
     return f'<path class="grid" d="M{x1:.1f},{y1:.1f} {x2:.1f},{y2:.1f}"/>'
+
+
+def _dot(x: float, y: float, colour: str, label: str) -> str:
+    title = f"<title>{escape(label)}</title>"
+    return f'<circle cx="{x:.1f}" cy="{y:.1f}" r="3.5" fill="{colour}">{title}</circle>'
 
 
 def _text(x: float, y: float, text: str, anchor: str = "start", weight: str = "normal") -> str:

@@ -237,6 +237,9 @@ def evaluate(
     github_summary: Annotated[
         bool, typer.Option("--github-summary", help="Append to the summary of GitHub Actions.")
     ] = False,
+    report: Annotated[
+        bool, typer.Option("--report", help="Write report.html and report.md too.")
+    ] = False,
     data: MovedData = None,
 ) -> None:
     """Measure a run on views it has not seen."""
@@ -246,7 +249,7 @@ def evaluate(
     demands = Demands(
         tuple(fail_under or ()), tuple(fail_over or ()), baseline, tuple(tolerance or ())
     )
-    output = Output(out, as_json, junit, github_summary)
+    output = Output(out, as_json, junit, github_summary, report)
     from gsdmsr_cli.commands import eval as command
 
     command.run(run_folder, request, demands, output, data)

@@ -81,6 +81,12 @@ def write_png(path: Path, image: NDArray[np.uint8]) -> None:
         temporary.write_bytes(encoded.tobytes())
 
 
+def encode_webp(image: NDArray[np.uint8], quality: int) -> bytes:
+    """Return (H, W, 3) RGB pixels as a lossy WebP picture; the quality is 1 to 100."""
+    ordered = cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
+    return cv2.imencode(".webp", ordered, (cv2.IMWRITE_WEBP_QUALITY, quality))[1].tobytes()
+
+
 def write_exr(path: Path, image: NDArray[np.float32], channels: tuple[str, ...]) -> None:
     """Write (H, W, C) numbers as a float32 OpenEXR file, exactly, whole or not at all.
 

@@ -78,3 +78,14 @@ def test_without_lines_there_are_axes_still() -> None:
 def test_values_too_small_to_tell_apart_are_one() -> None:
     ((_, places),) = paths_of(line_chart("t", "x", "y", [Line("a", [(0.0, 5e-324), (1.0, 0.0)])]))
     assert len(places) == 2
+
+
+def test_labelled_points_are_dots_on_the_line() -> None:
+    points = [(0.0, 20.0), (4.0, 30.0), (8.0, 22.0)]
+    chart = line_chart("t", "x", "y", [Line("a", points, ["p", "q & <r>", "s"])], (300, 200))
+    ((_, places),) = paths_of(chart)
+    dots = [c for c in ElementTree.fromstring(chart).iter(f"{SVG}circle") if len(c)]
+    assert [(float(d.get("cx") or 0), float(d.get("cy") or 0)) for d in dots] == places
+    assert [dot[0].text for dot in dots] == ["p", "q & <r>", "s"]
+    assert all(0 <= x <= 300 and 0 <= y <= 200 for x, y in places)
+    assert ElementTree.fromstring(chart).get("viewBox") == "0 0 300 200"

@@ -106,7 +106,7 @@ def test_version(gsdmsr: Gsdmsr, capsys: pytest.CaptureFixture[str]) -> None:
             "eval r --split val --background both --downscale 2 --lpips-weights w --lpips-inria"
             " --json --fail-under psnr=25 --fail-under ssim=0.9 --fail-over lpips_alex=0.1"
             " --baseline b.json --tolerance psnr=0.5 --junit j.xml --github-summary --out o"
-            " --data d",
+            " --report --data d",
             "eval",
             (
                 Path("r"),
@@ -114,7 +114,7 @@ def test_version(gsdmsr: Gsdmsr, capsys: pytest.CaptureFixture[str]) -> None:
                 Demands(
                     ("psnr=25", "ssim=0.9"), ("lpips_alex=0.1",), Path("b.json"), ("psnr=0.5",)
                 ),
-                Output(Path("o"), True, Path("j.xml"), True),
+                Output(Path("o"), True, Path("j.xml"), True, True),
                 Path("d"),
             ),
         ),

@@ -11,6 +11,7 @@ from gsdmsr_cli.commands import eval as evaluate
 from gsdmsr_cli.commands import render, train
 from gsdmsr_cli.commands._progress import progress_bar
 from gsdmsr_cli.errors import DataError, UsageError
+from gsdmsr_cli.evaluation.request import Output
 from gsdmsr_cli.filming.request import Request
 from gsdmsr_cli.synthetic import write_scene
 
@@ -33,7 +34,7 @@ def run(out: Path) -> None:
     _write_scene(scene)
     overrides = [f"training.budget={BUDGET}"]
     train.run(scene, run_folder, "dnerf", None, overrides, "auto", False, run_folder.exists())
-    evaluate.run(run_folder)
+    evaluate.run(run_folder, None, None, Output(report=True))
     render.run(run_folder, Request(), None)
     Console().out(_where_to_look(scene, run_folder), highlight=False)
 
@@ -61,6 +62,7 @@ def _where_to_look(scene: Path, run_folder: Path) -> str:
     places = [("the pictures it learnt from", scene / "train")]
     places += [("video", path) for path in sorted(run_folder.rglob("*.webm"))]
     places += [("scores", run_folder / "eval" / "metrics.json")]
+    places += [("report, for a browser", run_folder / "eval" / "report.html")]
     lines = [f"  {what}: {path}" for what, path in places]
     folder = shlex.quote(str(run_folder))
     export = f"gsdmsr export {folder} --format ply --time 0.5 --out half.ply"

@@ -12,7 +12,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from gsdmsr_cli.commands._measure import describe, measure
-from gsdmsr_cli.commands._trained import open_trained
+from gsdmsr_cli.commands._trained import Trained, open_trained
 from gsdmsr_cli.errors import DataError, ThresholdError, UsageError
 from gsdmsr_cli.evaluation import summary
 from gsdmsr_cli.evaluation.gates import Verdict, read_gates
@@ -21,6 +21,8 @@ from gsdmsr_cli.evaluation.markdown import markdown
 from gsdmsr_cli.evaluation.request import BOTH, Demands, Output, Request
 from gsdmsr_cli.evaluation.summary import Document
 from gsdmsr_cli.files import require_folder, write_json, write_text
+from gsdmsr_cli.reporting.page import page
+from gsdmsr_cli.reporting.stills import make_stills
 
 SUMMARY_VARIABLE = "GITHUB_STEP_SUMMARY"
 """Environment variable in which GitHub Actions names the file of a step's summary."""
@@ -59,8 +61,14 @@ def run(
     _print(document, verdicts, path, output.as_json)
     if output.junit:
         write_text(output.junit, junit("gsdmsr.eval", document, verdicts))
+    text = markdown(_heading(run_folder), document, verdicts)
     if summary_path:
-        _append(summary_path, markdown(_heading(run_folder), document, verdicts))
+        _append(summary_path, text)
+    if output.report:
+        write_text(folder / "report.md", text)
+        write_text(folder / "report.html", _page(trained, document, verdicts))
+        if not output.as_json:
+            Console().out(f"report: {folder / 'report.html'}", highlight=False)
     missed = [verdict.found for verdict in verdicts if not verdict.passed]
     if missed:
         raise ThresholdError("; ".join(missed))
@@ -68,6 +76,13 @@ def run(
 
 def _heading(run_folder: Path) -> str:
     return f"gsdmsr eval {run_folder.resolve().name}"
+
+
+def _page(trained: Trained, document: Document, verdicts: Sequence[Verdict]) -> str:
+    views, frames = trained.scene.split(document["protocol"]["split"]), document["frames"]
+    stills, full = make_stills(trained.studio, views, frames)
+    name, log = trained.run.root.resolve().name, trained.run.read_log()
+    return page(name, document, verdicts, log, stills, full)
 
 
 def _summary_path() -> Path:

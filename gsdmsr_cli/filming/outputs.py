@@ -65,8 +65,18 @@ def picture(output: str, layers: Layers, ends: Ends, true: Floats | None) -> Pix
         fastest = np.float32(ends.fast * max(layers.alpha.shape))
         return colour_wheel(layers.flow / fastest * layers.alpha[..., None])
     assert output == "error" and true is not None
-    drawn = eight_bits(layers.rgb).astype(np.float32) / 255
-    return turbo(np.abs(drawn - true).mean(2) / FULL_ERROR)
+    return error_colours(eight_bits(layers.rgb), true, FULL_ERROR)
+
+
+def error_colours(drawn: Pixels, true: Floats, full: float) -> Pixels:
+    """Return how far colours are apart on average, from blue at 0 to red at ``full``.
+
+    Args:
+        drawn: (H, W, 3) the drawn picture.
+        true: (H, W, 3) the true one in [0, 1].
+        full: mean absolute difference at which the colours end.
+    """
+    return turbo(np.abs(drawn.astype(np.float32) / 255 - true).mean(2) / np.float32(full))
 
 
 def numbers(output: str, layers: Layers) -> Floats:

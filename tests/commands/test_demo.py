@@ -51,9 +51,10 @@ def test_it_makes_trains_evaluates_renders_and_tells(
     budget = load_preset(preset, config, overrides).training.budget
     assert budget is not None
     assert parse_duration(budget) <= 90
+    assert calls[1][1][0] == run_folder and calls[1][1][-1].report
     told = capsys.readouterr().out
-    for path in (out / "scene" / "train", out / "run" / "orbit.webm", out / "run" / "eval"):
-        assert str(path) in told
+    for path in ("scene/train", "run/orbit.webm", "run/eval/metrics.json", "run/eval/report.html"):
+        assert str(out / path) in told
 
 
 def test_an_earlier_demo_is_made_anew(tmp_path: Path, calls: Calls) -> None:

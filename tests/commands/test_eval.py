@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -21,6 +22,7 @@ from gsdmsr_cli.commands import eval as evaluation
 from gsdmsr_cli.evaluation import speed
 from gsdmsr_cli.evaluation.lpips import Lpips, load_lpips
 from gsdmsr_cli.imaging import read_image
+from gsdmsr_cli.reporting.markup import at
 from gsdmsr_cli.synthetic import write_scene
 
 SIDE = 176
@@ -230,3 +232,22 @@ def test_wishes_that_cannot_be_met_are_refused_before_the_work(
     assert "no such metric" in refuse(2, "--fail-over", "fid=3")
     assert "use --fail-over" in refuse(2, "--fail-under", "lpips_alex=0.1")
     assert "file/eval: cannot be made" in refuse(3, "--out", tmp_path / "file" / "eval")
+
+
+def test_the_report_shows_the_run_in_one_file(
+    run: Path, evaluate: Eval, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    document = evaluate("--background", "both", "--report", "--out", tmp_path)
+    assert {path.name for path in tmp_path.iterdir()} == {
+        "metrics.json", "report.html", "report.md",
+    }  # fmt: skip
+    page = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert len(page) < 5_000_000
+    for name in (frame["name"] for frame in document["frames"]):
+        assert f"ground truth of {name}" in page  # all three are among the worst or the best
+    figures = re.findall(r'<data value="([^"]+)" data-of="([^"]+)">', page)
+    assert len(figures) > 40
+    for value, path in figures:
+        assert float(value) == at(document, path), path
+    assert page.count("<svg") == 3 and "drawing and gradients" in page
+    assert f"{document['aggregate']['psnr']:.4f}" in (tmp_path / "report.md").read_text()

@@ -1,0 +1,257 @@
+"""The report as one HTML file: no network, no other files, light and dark, narrow and wide."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from html import escape
+from importlib import resources
+
+from gsdmsr_cli.evaluation import summary
+from gsdmsr_cli.evaluation.catalogue import METRICS
+from gsdmsr_cli.evaluation.gates import Verdict
+from gsdmsr_cli.evaluation.summary import Document, value_of
+from gsdmsr_cli.reporting.markup import at, bars, figure, table, terms
+from gsdmsr_cli.reporting.plots import Log, plots
+from gsdmsr_cli.reporting.stills import Still
+from gsdmsr_cli.reporting.viewer import viewer
+from gsdmsr_cli.scene import SPLITS
+
+_POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'unsafe-inline'"
+
+_TILE_LPIPS = ("lpips_alex", "lpips_vgg", "lpips_squeeze")
+"""The first of these that has a value is shown large."""
+
+_STAGES = {
+    "load_s": "reading pictures",
+    "compile_s": "preparing kernels",
+    "stages_s.look": "drawing and gradients",
+    "stages_s.learn": "optimiser",
+    "stages_s.grow": "growing and pruning",
+    "stages_s.watch": "watching a view",
+    "stages_s.save": "checkpoints",
+    "stages_s.other": "other",
+}
+_PARTS = {
+    "splats_bytes": "Gaussians",
+    "motion_bytes": "motion",
+    "training_state_bytes": "state of training",
+}
+
+
+def page(
+    heading: str,
+    document: Document,
+    verdicts: Sequence[Verdict],
+    log: Log,
+    stills: Sequence[Still],
+    full: float,
+) -> str:
+    """Return the page.
+
+    Args:
+        heading: name of the run.
+        document: the content of ``metrics.json``.
+        verdicts: on what was asked of it.
+        log: of the training.
+        stills: frames to show, worst first.
+        full: see ``viewer``.
+    """
+    about = document["protocol"]
+    own = resources.files(__package__)
+    style, script = (own.joinpath(name).read_text("utf-8") for name in ("page.css", "page.js"))
+    lede = (
+        f"{summary.title(document)} · on {' and '.join(summary.backgrounds(document))} · "
+        f"preset {about['preset']}, motion {about['motion']}, seed {about['seed']}"
+    )
+    charts = "".join(f'<div class="card chart">{chart}</div>' for chart in plots(document, log))
+    costs = _time(document) + _storage(document)
+    frames = viewer(document, stills, full)
+    body = [
+        _section("", _verdicts(verdicts)),
+        _section("Figures", f'<div class="grid">{_scores(document)}{_splits(document)}</div>'),
+        _section("Over time", f'<div class="grid">{charts}</div>' if charts else ""),
+        _section("Worst and best frames", f'<div class="card">{frames}</div>' if frames else ""),
+        _section("Time and storage", f'<div class="grid">{costs}</div>'),
+        _section("Every frame", _frames(document)),
+        _section("Protocol", _protocol(document)),
+    ]
+    return f"""<!doctype html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<meta http-equiv="Content-Security-Policy" content="{_POLICY}">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<title>{escape(heading)}: evaluation</title>
+<style>
+{style}</style>
+</head>
+<body>
+<header>
+<p class="kicker">gsdmsr evaluation</p>
+<h1>{escape(heading)}</h1>
+<p class="lede">{escape(lede)}</p>
+{_tiles(document)}
+</header>
+<main>
+{"".join(body)}</main>
+<footer>Written by gsdmsr {escape(about["versions"]["gsdmsr"])}. Every figure here stands,
+unrounded, in metrics.json beside this page.</footer>
+<script>
+{script}</script>
+</body>
+</html>
+"""
+
+
+def _section(title: str, content: str) -> str:
+    if not content:
+        return ""
+    head = f"<h2>{escape(title)}</h2>\n" if title else ""
+    return f"<section>\n{head}{content}\n</section>\n"
+
+
+def _tiles(document: Document) -> str:
+    split, splits = document["protocol"]["split"], document["splits"]
+    others = " · ".join(
+        f"{name} {figure(document, f'splits.{name}.psnr', '.2f')}"
+        for name in SPLITS
+        if name in splits and name != split
+    )
+    model = sum(document["storage"][part] for part in ("splats_bytes", "motion_bytes"))
+    tiles = [
+        (
+            f"PSNR, {split}",
+            f"{figure(document, 'aggregate.psnr', '.2f')} <small>dB</small>",
+            others,
+        ),
+        ("SSIM", figure(document, "aggregate.ssim"), ""),
+    ]
+    for name in _TILE_LPIPS:
+        if value_of(document["aggregate"], name) is not None:
+            kind = name.removeprefix("lpips_")
+            text = figure(document, f"aggregate.{name}.value")
+            tiles.append((f"LPIPS, {kind}", text, "less is better"))
+            break
+    raster = f"{figure(document, 'speed.fps_raster', '.0f')} without motion"
+    training = document["training"]
+    tiles += [
+        ("Frames a second", figure(document, "speed.fps", ".0f"), raster),
+        ("Model", f"{model / 1e6:.2f} <small>MB</small>", f"{training['splats']:,} Gaussians"),
+        (
+            "Training",
+            f"{figure(document, 'training.train_s', '.0f')} <small>s</small>",
+            f"{training['steps']:,} steps",
+        ),
+    ]
+    cells = "".join(
+        f'<div class="tile"><dt>{title}</dt><dd>{value}</dd><dd class="under">{under}</dd></div>'
+        for title, value, under in tiles
+    )
+    return f'<dl class="tiles">{cells}</dl>'
+
+
+def _verdicts(verdicts: Sequence[Verdict]) -> str:
+    if not verdicts:
+        return ""
+    items = "".join(
+        f'<li class="{word}"><b>{word}</b><span>{escape(verdict.found)}</span></li>'
+        for verdict in verdicts
+        for word in ("passed" if verdict.passed else "failed",)
+    )
+    return f'<h2>Asked for</h2><div class="card"><ul class="verdicts">{items}</ul></div>'
+
+
+def _scores(document: Document) -> str:
+    over = summary.backgrounds(document)
+    roots = ["aggregate", *(f"backgrounds.{name}.aggregate" for name in document["backgrounds"])]
+    present = [metric for metric in METRICS if metric in document["aggregate"]]
+    rows = [
+        (metric, *(_score(document, f"{root}.{metric}") for root in roots)) for metric in present
+    ]
+    heads = ("mean over frames", *(f"on {name}" for name in over))
+    return f'<div class="card wide">{table(heads, rows)}</div>'
+
+
+def _score(document: Document, path: str) -> str:
+    entry = at(document, path)
+    if isinstance(entry, dict):
+        missing = f'<abbr title="{escape(str(entry["reason"]))}">none</abbr>'
+        return missing if entry["value"] is None else figure(document, f"{path}.value")
+    return figure(document, path)
+
+
+def _splits(document: Document) -> str:
+    own, names = document["protocol"]["split"], [n for n in SPLITS if n in document["splits"]]
+    heads = ("", *(f'<span class="own">{n}</span>' if n == own else n for n in names))
+    rows = [
+        ("PSNR [dB]", *(figure(document, f"splits.{n}.psnr", ".2f") for n in names)),
+        ("views", *(figure(document, f"splits.{n}.frames", "d") for n in names)),
+    ]
+    gap = _gap(document)
+    reasons = [
+        (metric, entry["reason"])
+        for metric, entry in document["aggregate"].items()
+        if isinstance(entry, dict) and entry["value"] is None
+    ]
+    missing = f"<h3>Without a value</h3>{terms(reasons)}" if reasons else ""
+    return f'<div class="card wide">{table(heads, rows)}{gap}{missing}</div>'
+
+
+def _gap(document: Document) -> str:
+    splits, own = document["splits"], document["protocol"]["split"]
+    seen, unseen = (splits.get(name, {}).get("psnr") for name in ("train", own))
+    if seen is None or unseen is None:
+        return ""
+    word = "more" if seen >= unseen else "less"
+    return (
+        f'<p class="note">Views that it was trained on score {abs(seen - unseen):.2f} dB {word} '
+        f"than those of {own}.</p>"
+    )
+
+
+def _time(document: Document) -> str:
+    rows = [
+        (name, f"{figure(document, f'training.{path}', '.1f')} s", value)
+        for path, name in _STAGES.items()
+        if (value := at(document, f"training.{path}")) is not None
+    ]
+    return f'<div class="card"><h3>Time of the training</h3>{bars(rows)}</div>'
+
+
+def _storage(document: Document) -> str:
+    rows = [
+        (name, f"{figure(document, f'storage.{part}', '.2f', 1e6)} MB", document["storage"][part])
+        for part, name in _PARTS.items()
+    ]
+    whole = figure(document, "storage.checkpoint_bytes", ".2f", 1e6)
+    note = f'<p class="note">The file of the checkpoint has {whole} MB.</p>'
+    return f'<div class="card"><h3>Storage by part</h3>{bars(rows)}{note}</div>'
+
+
+def _frames(document: Document) -> str:
+    present = [m for m in METRICS if any(m in frame for frame in document["frames"])]
+    rows = [
+        (
+            escape(str(frame["name"])),
+            figure(document, f"frames.{i}.time", ".3f"),
+            *(figure(document, f"frames.{i}.{m}") if m in frame else "" for m in present),
+        )
+        for i, frame in enumerate(document["frames"])
+    ]
+    shown = table(("frame", "time", *present), rows)
+    count = len(document["frames"])
+    return f'<details class="card wide"><summary>All {count} frames</summary>{shown}</details>'
+
+
+def _protocol(document: Document) -> str:
+    about = document["protocol"]
+    width, height = about["resolution"]
+    pairs: Iterable[tuple[str, str]] = (
+        ("pictures", f"{width} x {height} px, the data's sides divided by {about['downscale']}"),
+        ("checkpoint", f"{about['checkpoint']}, step {about['checkpoint_step']}"),
+        ("device", f"{about['processor']} ({about['device']})"),
+        ("data", about["data_fingerprint"]),
+        *(about["conventions"].items()),
+        ("versions", ", ".join(f"{name} {text}" for name, text in about["versions"].items())),
+    )
+    return f'<div class="card">{terms(pairs)}</div>'
