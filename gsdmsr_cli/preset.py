@@ -81,7 +81,8 @@ class SplatOptions:
     """The splats to start from.
 
     Attributes:
-        count: number of random splats where the scene brings no points.
+        count: number of splats where the scene brings no points or, with the start "surfaces",
+            fewer than that.
         start: where they lie: "box" evenly in the scene's box, "silhouettes" where the silhouettes
             of the train views overlap, "surfaces" where neighbouring train views agree.
         opacity: their opacity, between 0 and 1.

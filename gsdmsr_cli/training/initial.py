@@ -16,7 +16,7 @@ from gsdmsr_cli.preset import SplatOptions
 from gsdmsr_cli.scene import Scene
 from gsdmsr_cli.splats import Splats
 from gsdmsr_cli.training import silhouettes, surfaces
-from gsdmsr_cli.training.sightings import colours_of
+from gsdmsr_cli.training.sightings import Points, colours_of
 
 NEIGHBOURS = 3
 
@@ -34,24 +34,16 @@ def initial_splats(
 ) -> Splats:
     """Return isotropic splats as large as the distance to their neighbours (3DGS, section 5.1).
 
-    They sit at the scene's own points, coloured from the pictures if the format has no colours.
-    Without points ``options.start`` says where: at random in the box and nearly grey, as all
-    methods do on D-NeRF; where silhouettes overlap; or on surfaces, see the modules of these names.
+    They sit at the scene's own points. Where there are none, or the start is "surfaces" and there
+    are fewer than ``options.count``, others join them as ``options.start`` says: at random in the
+    box and nearly grey, as all methods do on D-NeRF; where silhouettes overlap; or on surfaces.
     """
-    if len(scene.points):
-        means = torch.from_numpy(scene.points)
-        if scene.colours is None:
-            colours = colours_of(means, scene, pictures)
-        else:
-            colours = torch.from_numpy(scene.colours)
-    elif options.start == "silhouettes":
-        found = silhouettes.sample_points(scene, pictures, background, options.count, generator)
-        means, colours = found
-    elif options.start == "surfaces":
-        means, colours = surfaces.sample_points(scene, pictures, options.count, generator)
-    else:
-        means = (2 * torch.rand(options.count, 3, generator=generator) - 1) * scene.bound
-        colours = 0.5 + SH_C0 * torch.rand(options.count, 3, generator=generator) / 255
+    given = _given_points(scene, pictures)
+    wanted = options.count - len(given.means)
+    if not len(given.means) or (options.start == "surfaces" and wanted > 0):
+        more = _new_points(scene, options.start, wanted, pictures, background, generator)
+        given = Points(*map(torch.cat, zip(given, more, strict=True)))
+    means, colours = given
     n = len(means)
     sh = torch.zeros(n, (options.sh_degree + 1) ** 2, 3)
     sh[:, 0] = (colours - 0.5) / SH_C0
@@ -64,6 +56,30 @@ def initial_splats(
         logit_opacities=torch.full((n,), math.log(options.opacity / (1 - options.opacity))),
         sh=sh,
     )
+
+
+def _given_points(scene: Scene, pictures: Pictures) -> Points:
+    """Return the scene's points, coloured from the pictures if the format has no colours."""
+    means = torch.from_numpy(scene.points)
+    if scene.colours is None:
+        return Points(means, colours_of(means, scene, pictures))
+    return Points(means, torch.from_numpy(scene.colours))
+
+
+def _new_points(
+    scene: Scene,
+    start: str,
+    count: int,
+    pictures: Pictures,
+    background: Tensor,
+    generator: torch.Generator,
+) -> Points:
+    if start == "silhouettes":
+        return silhouettes.sample_points(scene, pictures, background, count, generator)
+    if start == "surfaces":
+        return surfaces.sample_points(scene, pictures, count, generator)
+    means = (2 * torch.rand(count, 3, generator=generator) - 1) * scene.bound
+    return Points(means, 0.5 + SH_C0 * torch.rand(count, 3, generator=generator) / 255)
 
 
 def _spacing(means: Tensor, bound: float) -> Tensor:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import torch
 from torch import Tensor
 
@@ -11,6 +13,18 @@ from gsdmsr_cli.scene import Scene
 
 VIEWS = 40
 """At most so many views tell the colours of points, evenly spaced."""
+
+
+class Points(NamedTuple):
+    """Points to start from.
+
+    Attributes:
+        means: (P, 3) [world units].
+        colours: (P, 3) in [0, 1].
+    """
+
+    means: Tensor
+    colours: Tensor
 
 
 def places(points: Tensor, camera: Camera) -> tuple[Tensor, Tensor, Tensor]:
@@ -29,6 +43,8 @@ def colours_of(points: Tensor, scene: Scene, pictures: Pictures) -> Tensor:
 
     What hides a point counts as well, for want of knowing it; points that no view shows are grey.
     """
+    if not len(points):
+        return torch.zeros(0, 3)
     views = scene.split("train")
     total, seen = torch.zeros(len(points), 3), torch.zeros(len(points), 1)
     for view in views[:: -(-len(views) // VIEWS)]:

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import torch
 from torch import Tensor
 
 from gsdmsr_cli.pictures import Pictures
 from gsdmsr_cli.scene import Scene
-from gsdmsr_cli.training.sightings import places
+from gsdmsr_cli.training.sightings import Points, places
 
 CANDIDATES, MOST_CANDIDATES = 20, 500_000
 """Random points per point wanted, and how many at most, for the sake of memory."""
@@ -25,18 +23,6 @@ VIEWS = 100
 
 GRID = 100
 """Pictures are sampled at about so many pixels along a side, enough for a first guess."""
-
-
-class Points(NamedTuple):
-    """Random points with a colour.
-
-    Attributes:
-        means: (P, 3) [world units].
-        colours: (P, 3) in [0, 1].
-    """
-
-    means: Tensor
-    colours: Tensor
 
 
 def sample_points(

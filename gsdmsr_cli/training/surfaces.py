@@ -14,8 +14,7 @@ from gsdmsr_cli import imaging
 from gsdmsr_cli.camera import Camera
 from gsdmsr_cli.pictures import Pictures
 from gsdmsr_cli.scene import Scene
-from gsdmsr_cli.training.sightings import places
-from gsdmsr_cli.training.silhouettes import Points
+from gsdmsr_cli.training.sightings import Points, places
 
 VIEWS = 48
 """At most so many views send out rays, evenly spaced."""

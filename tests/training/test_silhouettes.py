@@ -14,7 +14,8 @@ from torch import Tensor
 from gsdmsr_cli.camera import Camera, look_at
 from gsdmsr_cli.pictures import Pictures
 from gsdmsr_cli.scene import Scene, View
-from gsdmsr_cli.training.silhouettes import Points, sample_points
+from gsdmsr_cli.training.sightings import Points
+from gsdmsr_cli.training.silhouettes import sample_points
 
 BOUND = 1.3
 WHITE, BLACK = (1.0, 1.0, 1.0), (0.0, 0.0, 0.0)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,8 +12,11 @@ from kernel_checks import generator
 from torch import Tensor
 
 from gsdmsr_cli.camera import Camera, look_at
+from gsdmsr_cli.geometry import SH_C0
 from gsdmsr_cli.pictures import Pictures
+from gsdmsr_cli.preset import SplatOptions
 from gsdmsr_cli.scene import Scene, View
+from gsdmsr_cli.training.initial import initial_splats
 from gsdmsr_cli.training.sightings import colours_of, places
 from gsdmsr_cli.training.surfaces import sample_points
 
@@ -79,6 +83,20 @@ def test_a_single_view_has_rays_but_no_depths() -> None:
     pixels = pictures.load(scene.views[0])[:, row.long(), column.long()].T / 255
     assert (points.colours - pixels).abs().mean() < 0.05
     assert points.means.norm(dim=1).std() > 0.1
+
+
+def test_surfaces_join_points_that_are_too_few() -> None:
+    scene, pictures = capture(5)
+    few = np.array([[0, WALL, 0], [0.1, WALL, 0]], np.float32)
+    scene = replace(scene, points=few, colours=np.full((2, 3), 0.25, np.float32))
+    for count, total in ((40, 40), (2, 2), (1, 2)):
+        options = SplatOptions(start="surfaces", count=count)
+        splats = initial_splats(scene, options, pictures, torch.ones(3), generator(0))
+        assert len(splats) == total
+        assert torch.equal(splats.means[:2], torch.from_numpy(few))
+        assert (SH_C0 * splats.sh[:2, 0] + 0.5).numpy() == pytest.approx(0.25)
+    options = SplatOptions(start="box", count=40)
+    assert len(initial_splats(scene, options, pictures, torch.ones(3), generator(0))) == 2
 
 
 def test_the_seed_decides() -> None:
