@@ -30,6 +30,13 @@ def test_png_is_read_as_stored(tmp_path: Path, channels: int) -> None:
     np.testing.assert_array_equal(read, pixels)
 
 
+def test_webp_is_the_picture_but_for_a_little() -> None:
+    pixels = np.full((20, 30, 3), (250, 120, 10), np.uint8)
+    found = cv2.imdecode(np.frombuffer(imaging.encode_webp(pixels, 90), np.uint8), 1)[..., ::-1]
+    assert found.shape == pixels.shape
+    assert np.abs(found.astype(int) - pixels).max() <= 6
+
+
 def test_alpha_stays_straight(tmp_path: Path) -> None:
     pixels = np.array([[[200, 100, 50, 128], [9, 8, 7, 0]]], np.uint8)
     write_picture(tmp_path / "a.png", pixels)

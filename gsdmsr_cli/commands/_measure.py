@@ -13,11 +13,10 @@ from gsdmsr_cli.evaluation.catalogue import PARTS, Metric, load_metrics
 from gsdmsr_cli.evaluation.metrics import Missing
 from gsdmsr_cli.evaluation.request import BOTH, Request
 from gsdmsr_cli.evaluation.speed import measure_speed
+from gsdmsr_cli.evaluation.summary import SCHEMA
 from gsdmsr_cli.files import read_json
 from gsdmsr_cli.preset import BACKGROUNDS
 from gsdmsr_cli.scene import SPLITS, View
-
-SCHEMA = 1
 
 OTHER_VIEWS = 20
 """Views of every other split, evenly spaced, whose PSNR is reported beside that of the split."""

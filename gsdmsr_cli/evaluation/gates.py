@@ -11,7 +11,7 @@ from typing import Any
 from gsdmsr_cli.errors import DataError, UsageError, nearest
 from gsdmsr_cli.evaluation.catalogue import METRICS, less_is_better
 from gsdmsr_cli.evaluation.request import Demands
-from gsdmsr_cli.evaluation.summary import value_of
+from gsdmsr_cli.evaluation.summary import SCHEMA, value_of
 from gsdmsr_cli.files import read_json
 
 SAME = ("split", "resolution", "background", "data_fingerprint")
@@ -161,6 +161,8 @@ def _read_report(path: Path) -> dict[str, Any]:
     document = read_json(path)
     if not all(isinstance(document.get(key), dict) for key in ("protocol", "aggregate")):
         raise DataError(f"{path}: is not a report of eval; give a metrics.json that it has written")
+    if document.get("schema") != SCHEMA:
+        raise DataError(f"{path}: has schema {document.get('schema')}; this version reads {SCHEMA}")
     return document
 
 

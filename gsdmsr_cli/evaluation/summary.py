@@ -7,6 +7,9 @@ from typing import Any
 
 from gsdmsr_cli.evaluation.catalogue import METRICS
 
+SCHEMA = 1
+"""Of the document; another number is another layout."""
+
 Document = Mapping[str, Any]
 """The content of a ``metrics.json``."""
 

@@ -124,7 +124,7 @@ def _tiles(document: Document) -> str:
             f"{figure(document, 'aggregate.psnr', '.2f')} <small>dB</small>",
             others,
         ),
-        ("SSIM", figure(document, "aggregate.ssim"), ""),
+        ("SSIM", figure(document, "aggregate.ssim"), _ms_ssim(document)),
     ]
     for name in _TILE_LPIPS:
         if value_of(document["aggregate"], name) is not None:
@@ -148,6 +148,12 @@ def _tiles(document: Document) -> str:
         for title, value, under in tiles
     )
     return f'<dl class="tiles">{cells}</dl>'
+
+
+def _ms_ssim(document: Document) -> str:
+    if value_of(document["aggregate"], "ms_ssim") is None:
+        return ""
+    return f"MS-SSIM {figure(document, 'aggregate.ms_ssim.value')}"
 
 
 def _verdicts(verdicts: Sequence[Verdict]) -> str:
@@ -215,7 +221,7 @@ def _time(document: Document) -> str:
         for path, name in _STAGES.items()
         if (value := at(document, f"training.{path}")) is not None
     ]
-    return f'<div class="card"><h3>Time of the training</h3>{bars(rows)}</div>'
+    return f'<div class="card"><h3>Time by stage of the training</h3>{bars(rows)}</div>'
 
 
 def _storage(document: Document) -> str:

@@ -6,6 +6,7 @@ import json
 import re
 import sys
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -14,15 +15,19 @@ import numba
 import numpy as np
 import pytest
 import torch
+from datasets import write_picture
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 from torchmetrics.functional.image import multiscale_structural_similarity_index_measure
 
 from gsdmsr_cli import cli
+from gsdmsr_cli.commands import _trained
 from gsdmsr_cli.commands import eval as evaluation
 from gsdmsr_cli.evaluation import speed
 from gsdmsr_cli.evaluation.lpips import Lpips, load_lpips
+from gsdmsr_cli.formats import read_scene
 from gsdmsr_cli.imaging import read_image
 from gsdmsr_cli.reporting.markup import at
+from gsdmsr_cli.scene import Scene
 from gsdmsr_cli.synthetic import write_scene
 
 SIDE = 176
@@ -232,6 +237,50 @@ def test_wishes_that_cannot_be_met_are_refused_before_the_work(
     assert "no such metric" in refuse(2, "--fail-over", "fid=3")
     assert "use --fail-over" in refuse(2, "--fail-under", "lpips_alex=0.1")
     assert "file/eval: cannot be made" in refuse(3, "--out", tmp_path / "file" / "eval")
+
+
+def test_parts_that_masks_choose_are_scored_where_they_are(
+    evaluate: Eval, refuse: Refuse, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In all frames but the first, the left half moves; a third of all pixels counts."""
+    moves = np.zeros((SIDE, SIDE, 1), np.uint8)
+    write_picture(tmp_path / "still.png", moves)
+    moves[:, : SIDE // 2] = 255
+    write_picture(tmp_path / "moves.png", moves)
+    counts = np.zeros((SIDE, SIDE, 1), np.uint8)
+    counts[: SIDE // 3] = 255
+    write_picture(tmp_path / "counts.png", counts)
+
+    def read(folder: Path) -> Scene:
+        scene = read_scene(folder)
+        views = [
+            replace(
+                view,
+                mask_path=tmp_path / "counts.png",
+                moving_path=tmp_path / ("still.png" if view.name == "r_000" else "moves.png"),
+            )
+            for view in scene.views
+        ]
+        return replace(scene, views=tuple(views))
+
+    plain = evaluate()
+    assert plain["parts"] == {}
+    monkeypatch.setattr(_trained, "read_scene", read)
+    document = evaluate("--fail-under", "psnr_moving=1")
+    assert {part: entry["frames"] for part, entry in document["parts"].items()} == {
+        "masked": 3, "moving": 2, "static": 3,
+    }  # fmt: skip
+    assert document["aggregate"]["psnr"] == plain["aggregate"]["psnr"]
+    first, *others = document["frames"]
+    assert "psnr_moving" not in first and first["psnr_static"] == first["psnr_masked"]
+    for frame in others:
+        errors = [10 ** (-frame[f"psnr_{part}"] / 10) for part in ("moving", "static", "masked")]
+        assert errors[2] == pytest.approx((errors[0] + errors[1]) / 2)
+    mean = np.mean([frame["psnr_moving"] for frame in others])
+    assert document["aggregate"]["psnr_moving"] == pytest.approx(mean)
+    monkeypatch.undo()
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path))
+    assert "psnr_moving has no value" in refuse(4, "--fail-under", "psnr_moving=1")
 
 
 def test_the_report_shows_the_run_in_one_file(

@@ -25,7 +25,7 @@ PROTOCOL = {
 
 
 def report(**aggregate: Any) -> dict[str, Any]:
-    return {"protocol": PROTOCOL, "aggregate": aggregate}
+    return {"schema": 1, "protocol": PROTOCOL, "aggregate": aggregate}
 
 
 def written(path: Path, document: Any) -> Path:
@@ -123,7 +123,10 @@ def test_a_tolerance_is_not_negative(tmp_path: Path) -> None:
         read_gates(Demands(baseline=earlier, tolerance=("psnr=-1",)))
 
 
-@pytest.mark.parametrize("content", ["{", "[]", "{}", '{"protocol": {}, "aggregate": 3}'])
+@pytest.mark.parametrize(
+    "content",
+    ["{", "[]", "{}", '{"protocol": {}, "aggregate": 3}', '{"protocol": {}, "aggregate": {}}'],
+)
 def test_a_baseline_that_is_no_report_is_bad_data(content: str, tmp_path: Path) -> None:
     (tmp_path / "a.json").write_text(content)
     with pytest.raises(DataError, match=r"a\.json: ") as caught:

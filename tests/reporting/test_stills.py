@@ -47,6 +47,7 @@ def test_nearly_all_errors_lie_below_the_scale() -> None:
     assert scale_of([error]) == 0.1
     error[:2] = 1.0
     assert scale_of([error]) == 1.0
+    assert scale_of([error * np.float32(np.nan)]) == 1.0  # of a broken render
 
 
 class Painter:
