@@ -23,13 +23,16 @@ PICTURES = ("images", "input", "rgb", "colmap/images", ".")
 TEST_EVERY = 8
 """Every 8th picture by name, from the first on, is for testing (Mip-NeRF 360, 3DGS)."""
 
-_OTHERS = ("transforms.json", "transforms_train.json", "dataset.json", "train_meta.json")
+_OTHERS = (
+    "transforms.json", "transforms_train.json", "dataset.json", "train_meta.json", "cam*.mp4",
+    "cam*/images",
+)  # fmt: skip
 """Files of layouts that say more and may have a COLMAP model beside them."""
 
 
 def matches(folder: Path) -> bool:
     """Tell whether ``folder`` holds a COLMAP model, and nothing that says more."""
-    return _model_folder(folder) is not None and not any((folder / n).is_file() for n in _OTHERS)
+    return _model_folder(folder) is not None and not any(any(folder.glob(n)) for n in _OTHERS)
 
 
 def read(folder: Path) -> Scene:

@@ -19,8 +19,14 @@ from gsdmsr_cli.training.sightings import Points, places
 VIEWS = 48
 """At most so many views send out rays, evenly spaced."""
 
-PARTNERS = (2, 4, 6, 9, 13, 18, 24, 32)
-"""Views that each is compared with, by their rank among the others in space and time."""
+PARTNERS = 8
+"""Views that each is compared with, the nearest in space and time."""
+
+BASELINE = 0.1
+"""How far their cameras stand from its own and from one another, in units of the cameras' spread.
+
+Without that, all of them could be frames of one camera that stands still.
+"""
 
 UNLIKE = 0.1
 """Difference of colours that says no more than "another thing", so that what is hidden in a few
@@ -75,13 +81,10 @@ class _Album:
         self._pictures = pictures
         self.cameras = [_shrunk(pictures.camera(view)) for view in self._views]
         self._loaded: dict[int, Tensor] = {}
-        centres = np.stack([camera.centre for camera in self.cameras])
-        times = np.array([view.time for view in self._views])
-        apart = np.linalg.norm(centres[:, None] - centres[None], axis=2) / scene.radius
-        self._order = np.argsort(
-            apart + np.abs(times[:, None] - times[None]), axis=1, kind="stable"
-        )
-        reach = float(np.linalg.norm(centres, axis=1).max())
+        self._centres = np.stack([camera.centre for camera in self.cameras])
+        self._times = np.array([view.time for view in self._views])
+        self._spread = np.linalg.norm(self._centres - self._centres.mean(axis=0), axis=1).max()
+        reach = float(np.linalg.norm(self._centres, axis=1).max())
         self.nearest, self.farthest = NEAREST, reach + scene.bound
 
     def __len__(self) -> int:
@@ -89,8 +92,17 @@ class _Album:
 
     def partners(self, row: int) -> list[int]:
         """Return the views to compare a view with."""
-        others = [int(other) for other in self._order[row] if other != row]
-        return [others[rank - 1] for rank in PARTNERS if rank <= len(others)]
+        apart = np.linalg.norm(self._centres - self._centres[row], axis=1)
+        later = np.abs(self._times - self._times[row])
+        least = BASELINE * self._spread
+        chosen: list[int] = []
+        for other in np.argsort(apart / max(self._spread, 1e-9) + later, kind="stable"):
+            taken = self._centres[[row, *chosen]]
+            if np.linalg.norm(taken - self._centres[other], axis=1).min() > least:
+                chosen.append(int(other))
+            if len(chosen) == PARTNERS:
+                break
+        return chosen
 
     def picture(self, row: int) -> Tensor:
         """Return a shrunk picture, (3, h, w) in [0, 1]."""

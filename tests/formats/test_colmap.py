@@ -168,6 +168,12 @@ def test_a_folder_that_says_more_is_of_another_layout(folder: Path) -> None:
     write_json(folder / "transforms.json", {"frames": []})
     with pytest.raises(DataError, match=r"transforms\.json: no train frames"):
         read_scene(folder)
+    (folder / "transforms.json").unlink()
+    np.save(folder / "poses_bounds.npy", np.zeros((2, 17)))
+    assert read_scene(folder).layout == "colmap"  # LLFF's pictures
+    (folder / "cam00" / "images").mkdir(parents=True)
+    with pytest.raises(DataError, match="has 2 poses, but there are 1 cameras"):
+        read_scene(folder)
 
 
 @pytest.mark.parametrize(

@@ -47,22 +47,30 @@ class Album(Pictures):
         return self.pictures[int(view.name)]
 
 
-def capture(count: int) -> tuple[Scene, Album]:
+def capture(count: int, moments: int = 1) -> tuple[Scene, Album]:
+    """Cameras along a line; each takes the wall at so many moments, or one after the other."""
     shots = []
     for i in range(count):
         centre = np.array([-1 + 2 * i / max(count - 1, 1), -3.0, 0.4 * np.sin(2.5 * i)])
         pose = look_at(centre, np.array([0.0, WALL, 0]), np.array([0.0, 0.0, 1.0]))
         shots.append(Camera(pose, 90.0, 90.0, 48.0, 40.0, 96, 80))
+    times = [i / max(count - 1, 1) for i in range(count)]
+    if moments > 1:
+        times = [t / moments for _ in shots for t in range(moments)]
+        shots = [shot for shot in shots for _ in range(moments)]
     views = tuple(
-        View(str(i), shot, i / max(count - 1, 1), "train", Path()) for i, shot in enumerate(shots)
+        View(str(i), shot, time, "train", Path())
+        for i, (shot, time) in enumerate(zip(shots, times, strict=True))
     )
     nothing = np.zeros((0, 3), np.float32)
     scene = Scene(Path(), "test", views, nothing, None, None, 3.0, "")
     return scene, Album([photograph(shot) for shot in shots])
 
 
-def test_points_lie_on_the_wall_in_its_colours() -> None:
-    scene, pictures = capture(12)
+@pytest.mark.parametrize("moments", [1, 30])
+def test_points_lie_on_the_wall_in_its_colours(moments: int) -> None:
+    """For one camera that moves, and for a rig of cameras that do not."""
+    scene, pictures = capture(12, moments)
     points = sample_points(scene, pictures, 600, generator(0))
     assert points.means.shape == points.colours.shape == (600, 3)
     off = (points.means[:, 1] - WALL).abs()
