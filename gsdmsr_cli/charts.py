@@ -85,7 +85,9 @@ def line_chart(
 def _ticks(values: Sequence[float]) -> list[float]:
     """Return about six round numbers, evenly spaced, that reach from below to above the values."""
     low, high = (min(values), max(values)) if values else (0.0, 1.0)
-    span = max(high - low, 1e-6 * max(abs(low), abs(high)))
+    largest = max(abs(low), abs(high))
+    # ticks are told with six digits; of a line that is level they may lie farther apart
+    span = max(high - low, (1e-4 if high > low else 0.1) * largest)
     span = span if span > 1e-12 else 1.0
     power = 10 ** math.floor(math.log10(span / _TICKS))
     step = next(s * power for s in (1, 2, 5, 10, 20) if span / (s * power) <= _TICKS)

@@ -69,6 +69,13 @@ def test_ticks_are_round() -> None:
     assert _ticks([0.12, 0.17]) == [0.12, 0.13, 0.14, 0.15, 0.16, 0.17]
 
 
+@given(finite, st.one_of(st.just(0.0), st.floats(1e-9, 1e6)))
+@settings(max_examples=80, deadline=None)
+def test_ticks_are_told_apart(low: float, span: float) -> None:
+    labels = [f"{tick:g}" for tick in _ticks([low, low + span])]
+    assert len(set(labels)) == len(labels)
+
+
 def test_without_lines_there_are_axes_still() -> None:
     chart = line_chart("t", "x", "y", [Line("a", []), Line("b", [(1.0, 2.0)])])
     assert not paths_of(chart)

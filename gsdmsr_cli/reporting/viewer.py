@@ -66,9 +66,11 @@ def _strip(document: Document, title: str, stills: Sequence[Still]) -> str:
 def _shot(document: Document, still: Still, full: float) -> str:
     name = escape(_name(document, still))
     size = f'width="{still.width}" height="{still.height}"'
+    ratio = f"--ratio:{still.width / still.height:.4f}"
     small = " small" if max(still.width, still.height) < SMALL else ""
     return (
-        f'<figure class="shot" id="f{still.index}"><div class="pair{small}"><div class="compare">'
+        f'<figure class="shot" id="f{still.index}"><div class="pair{small}" style="{ratio}">'
+        '<div class="compare">'
         f'<img {size} src="{still.true}" alt="ground truth of {name}">'
         f'<img class="drawn" {size} src="{still.drawn}" alt="render of {name}">'
         '<span class="tag left">ground truth</span><span class="tag right">render</span>'
