@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import re
 import subprocess
 import sys
 import time
@@ -22,8 +23,8 @@ from gsdmsr_cli.filming.request import Request
 from gsdmsr_cli.preset import load_preset
 
 COMMANDS = (
-    "train", "eval", "render", "export", "demo", "doctor", "weights", "benchmark_kernels",
-    "benchmark_scenes",
+    "prepare", "train", "eval", "render", "export", "demo", "doctor", "weights",
+    "benchmark_kernels", "benchmark_scenes", "benchmark_resume", "benchmark_still",
 )  # fmt: skip
 
 
@@ -322,3 +323,22 @@ def test_debug_shows_the_traceback(
     error = capsys.readouterr().err
     assert "Traceback" in error
     assert error.splitlines()[-1].startswith("error: internal: ZeroDivisionError")
+
+
+ROOT = Path(__file__).parent.parent
+PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").glob("*.md")])
+
+
+def examples(page: Path) -> list[str]:
+    """Return the calls of gsdmsr in a page's blocks of code, but for those that tell of syntax."""
+    blocks = re.findall(r"^```\w*\n(.*?)^```$", page.read_text(encoding="utf-8"), re.M | re.S)
+    lines = "\n".join(blocks).replace("\\\n", " ").splitlines()
+    calls = (re.split(r"\s[#|]", line)[0].strip().removeprefix("- run: ") for line in lines)
+    syntax = re.compile(r"\[|\s[A-Z]+\b")
+    return [call for call in calls if call.startswith("gsdmsr ") and not syntax.search(call)]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_the_command_line_understands_the_examples_in_pages(page: Path, gsdmsr: Gsdmsr) -> None:
+    for call in examples(page):
+        assert gsdmsr(call.removeprefix("gsdmsr ")) == 0, call
