@@ -17,8 +17,12 @@ from gsdmsr_cli.camera import Camera
 
 Floats = NDArray[np.float64]
 
-WIDEST, NARROWEST = 0.25, 8.0
-"""Bounds of the pinhole's focal length, in units of the lens's."""
+WIDEST, NARROWEST = 0.7, 8.0
+"""Bounds of the pinhole's focal length, in units of the lens's.
+
+A fisheye may record more than a pinhole can show; seeing ever more of it would cost ever more of
+the resolution in the middle.
+"""
 
 _GRID = 41
 """Points along each side of a picture at which a pinhole is tried."""
@@ -105,7 +109,7 @@ class Lens:
         """Return the pinhole whose pictures replace the recorded ones, of the same size.
 
         It has the lens's principal point and proportions, and sees as much as it can without
-        showing anything that was not recorded.
+        showing anything that was not recorded, within ``WIDEST``.
         """
         zoom = 1.0 if self.is_pinhole else _zoom(self)
         return Camera(

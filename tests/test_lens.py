@@ -102,6 +102,12 @@ def test_the_pinhole_shows_all_it_can_and_nothing_else(
     assert -0.05 <= gap <= 0.05
 
 
+def test_a_fisheye_keeps_its_resolution_in_the_middle() -> None:
+    """One of 180 degrees has rays for a pinhole of any width."""
+    lens = Lens(100 / np.pi, 100 / np.pi, 50.0, 50.0, 100, 100, fisheye=True)
+    assert lens.camera(np.eye(4)).fx == pytest.approx(0.7 * 100 / np.pi, rel=1e-6)
+
+
 def test_a_lens_that_folds_at_the_rim_is_zoomed_past_the_fold() -> None:
     """1 + k r^2 with k = -0.5 is not monotone beyond r = sqrt(1 / 1.5) = 0.82."""
     lens = Lens(50.0, 50.0, 50.0, 50.0, 100, 100, (-0.5,))
