@@ -5,14 +5,17 @@ from __future__ import annotations
 import base64
 import json
 import os
+import select
 import shutil
 import subprocess
-import time
 from pathlib import Path
 from typing import Any
 
 VARIABLE = "GSDMSR_CHROMIUM"
 NAMES = ("chromium", "chromium-browser", "google-chrome", "chrome", "chrome-headless-shell")
+
+PATIENCE = 60.0
+"""Longest silence of the browser [s]."""
 
 OPTIONS = (
     "--headless=new", "--no-sandbox", "--disable-gpu", "--hide-scrollbars", "--no-first-run",
@@ -71,19 +74,22 @@ class Chromium:
         if self._session:
             message["sessionId"] = self._session
         os.write(self._write, json.dumps(message).encode() + b"\0")
-        deadline = time.monotonic() + 60
-        while time.monotonic() < deadline:
-            answer = self._receive()
-            if answer.get("id") == self._number:
-                assert "error" not in answer, answer
-                return dict(answer["result"])
+        while (answer := self._receive()).get("id") != self._number:
             self.events.append(answer)
-        raise TimeoutError(method)
+        assert "error" not in answer, answer
+        return dict(answer["result"])
 
     def _receive(self) -> dict[str, Any]:
+        """Return the next message.
+
+        Raises:
+            OSError: the browser has ended or says nothing any more.
+        """
         while b"\0" not in self._rest:
-            chunk = os.read(self._read, 1 << 20)
-            assert chunk, "the browser has ended"
+            ready, _, _ = select.select([self._read], [], [], PATIENCE)
+            chunk = os.read(self._read, 1 << 20) if ready else b""
+            if not chunk:
+                raise OSError("the browser says nothing")
             self._rest += chunk
         message, self._rest = self._rest.split(b"\0", 1)
         return dict(json.loads(message))

@@ -45,30 +45,27 @@ def run(
     """
     request, demands, output = request or Request(), demands or Demands(), output or Output()
     gates = read_gates(demands)
-    summary_path = _summary_path() if output.github_summary else None
-    if output.junit and demands == Demands():
+    if output.junit and not (gates.bounds or gates.baseline):
         raise UsageError("--junit has nothing to tell of: give a threshold or a --baseline")
+    summary_path = _summary_path() if output.github_summary else None
     background = None if request.background == BOTH else request.background
     trained = open_trained(run_folder, data, background, request.downscale)
     protocol, folder = describe(trained, request), output.folder or run_folder / "eval"
     if gates.baseline:
         gates.baseline.require_same(protocol)
     require_folder(folder)
+    if output.junit:
+        require_folder(output.junit.parent)
     document = measure(trained, request)
     verdicts = gates.judge(document)
-    path = folder / "metrics.json"
-    write_json(path, document)
-    _print(document, verdicts, path, output.as_json)
+    write_json(folder / "metrics.json", document)
+    _print(document, verdicts, folder / "metrics.json", output.as_json)
     if output.junit:
         write_text(output.junit, junit("gsdmsr.eval", document, verdicts))
-    text = markdown(_heading(run_folder), document, verdicts)
     if summary_path:
-        _append(summary_path, text)
+        _append(summary_path, markdown(_heading(run_folder), document, verdicts))
     if output.report:
-        write_text(folder / "report.md", text)
-        write_text(folder / "report.html", _page(trained, document, verdicts))
-        if not output.as_json:
-            Console().out(f"report: {folder / 'report.html'}", highlight=False)
+        _report(folder, trained, document, verdicts, output.as_json)
     missed = [verdict.found for verdict in verdicts if not verdict.passed]
     if missed:
         raise ThresholdError("; ".join(missed))
@@ -78,11 +75,22 @@ def _heading(run_folder: Path) -> str:
     return f"gsdmsr eval {run_folder.resolve().name}"
 
 
-def _page(trained: Trained, document: Document, verdicts: Sequence[Verdict]) -> str:
+def _report(
+    folder: Path,
+    trained: Trained,
+    document: Document,
+    verdicts: Sequence[Verdict],
+    quietly: bool,
+) -> None:
+    """Write the report for people, as HTML and as Markdown, and say where unless ``quietly``."""
+    root = trained.run.root
     views, frames = trained.scene.split(document["protocol"]["split"]), document["frames"]
     stills, full = make_stills(trained.studio, views, frames)
-    name, log = trained.run.root.resolve().name, trained.run.read_log()
-    return page(name, document, verdicts, log, stills, full)
+    html = page(root.resolve().name, document, verdicts, trained.run.read_log(), stills, full)
+    write_text(folder / "report.md", markdown(_heading(root), document, verdicts))
+    write_text(folder / "report.html", html)
+    if not quietly:
+        Console().out(f"report: {folder / 'report.html'}", highlight=False)
 
 
 def _summary_path() -> Path:

@@ -237,6 +237,8 @@ def test_wishes_that_cannot_be_met_are_refused_before_the_work(
     assert "no such metric" in refuse(2, "--fail-over", "fid=3")
     assert "use --fail-over" in refuse(2, "--fail-under", "lpips_alex=0.1")
     assert "file/eval: cannot be made" in refuse(3, "--out", tmp_path / "file" / "eval")
+    gate = "--fail-under", "psnr=1"
+    assert "file: cannot be made" in refuse(3, *gate, "--junit", tmp_path / "file" / "j.xml")
 
 
 def test_parts_that_masks_choose_are_scored_where_they_are(

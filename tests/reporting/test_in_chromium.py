@@ -24,7 +24,11 @@ def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Chromium]:
     binary = find_chromium()
     if binary is None:
         pytest.skip(f"no Chromium on the path; {VARIABLE} may name one")
-    with Chromium(binary, tmp_path_factory.mktemp("profile")) as chromium:
+    try:
+        chromium = Chromium(binary, tmp_path_factory.mktemp("profile"))
+    except OSError as error:
+        pytest.skip(f"{binary} does not start: {error}")
+    with chromium:
         yield chromium
 
 
