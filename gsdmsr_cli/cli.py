@@ -95,6 +95,16 @@ def prepare(
         Literal["auto", "sequential", "exhaustive", "both"],
         typer.Option(help="Which frames are compared with one another."),
     ] = "auto",
+    masks: Annotated[
+        Path | None,
+        typer.Option(metavar="DIR", help="Pictures that are white where something moves."),
+    ] = None,
+    invert_masks: Annotated[
+        bool, typer.Option("--invert-masks", help="Black is what moves in --masks.")
+    ] = False,
+    auto_mask: Annotated[
+        bool, typer.Option("--auto-mask", help="Look for what moves, in a first pass.")
+    ] = False,
     mapping: Annotated[
         Literal["incremental", "global"], typer.Option(help="COLMAP's mapper.")
     ] = "incremental",
@@ -108,11 +118,18 @@ def prepare(
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="Replace an earlier SCENE.")
     ] = False,
+    keep_stages: Annotated[
+        bool, typer.Option("--keep-stages", help="Keep them for a run with other options.")
+    ] = False,
     as_json: Json = False,
 ) -> None:
     """Turn a video or pictures into a scene with cameras."""
     from gsdmsr_cli.capture.options import CAMERA_MODELS, Options
 
+    if masks is not None and auto_mask:
+        raise UsageError("--masks and --auto-mask are both given; drop one")
+    if invert_masks and masks is None:
+        raise UsageError("--invert-masks needs --masks")
     if camera_model not in CAMERA_MODELS:
         raise UsageError(f"--camera-model {camera_model}: {nearest(camera_model, CAMERA_MODELS)}")
     options = Options(
@@ -121,14 +138,17 @@ def prepare(
         features=features,
         camera_model=camera_model,
         matching=matching,
+        auto_mask=auto_mask,
         mapping=mapping,
         min_registered=min_registered,
         test_every=test_every,
         seed=seed,
     )
+    from gsdmsr_cli.capture.prepare import Masks
     from gsdmsr_cli.commands import prepare as command
 
-    command.run(given, out, format_, options, overwrite, as_json)
+    given_masks = None if masks is None else Masks(masks, invert_masks)
+    command.run(given, out, format_, given_masks, options, overwrite, keep_stages, as_json)
 
 
 @app.command()

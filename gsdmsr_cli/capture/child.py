@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 import tempfile
+import threading
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -13,6 +15,9 @@ from gsdmsr_cli.errors import DataError, GsdmsrError
 
 REFUSED = 3
 """Exit code of a child that has told, on its last line, why the data cannot be used."""
+
+ONE_THREAD = {"OMP_NUM_THREADS": "1"}
+"""COLMAP has threads of its own where they do no harm; OpenMP's come and go with the load."""
 
 
 def run_child(job: str, arguments: Mapping[str, Any], tell: Callable[[int, int], None]) -> None:
@@ -33,7 +38,13 @@ def run_child(job: str, arguments: Mapping[str, Any], tell: Callable[[int, int],
     with (
         tempfile.TemporaryFile("w+", errors="replace") as said,
         subprocess.Popen(
-            line, stdout=subprocess.PIPE, stderr=said, text=True, start_new_session=True
+            line,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=said,
+            text=True,
+            start_new_session=True,
+            env=os.environ | ONE_THREAD,
         ) as process,
     ):
         try:
@@ -54,4 +65,14 @@ def run_child(job: str, arguments: Mapping[str, Any], tell: Callable[[int, int],
             said.seek(0)
             words = [word.strip() for word in said.read().split("\n") if word.strip()]
             reason = words[-1] if words else f"exit code {code}"
-            raise GsdmsrError(f"COLMAP has failed while {job}ing: {reason}")
+            raise GsdmsrError(f"COLMAP has failed in its job {job}: {reason}")
+
+
+def end_with_parent() -> None:
+    """In a child: end as soon as the parent has, however it did, and so its end of our stdin."""
+
+    def wait() -> None:
+        sys.stdin.read()
+        os._exit(1)
+
+    threading.Thread(target=wait, daemon=True).start()

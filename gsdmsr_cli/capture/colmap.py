@@ -13,8 +13,9 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from gsdmsr_cli.capture.child import REFUSED
+from gsdmsr_cli.capture.child import REFUSED, end_with_parent
 from gsdmsr_cli.capture.features import read_features
+from gsdmsr_cli.capture.masks import read_mask, standing
 from gsdmsr_cli.errors import DataError
 from gsdmsr_cli.files import write_json
 from gsdmsr_cli.native import load_pycolmap
@@ -32,6 +33,7 @@ def match(
     pictures: str,
     names: Sequence[str],
     features: str,
+    masks: str | None,
     camera_model: str,
     focal: float | None,
     pairs: Sequence[tuple[int, int]],
@@ -44,6 +46,7 @@ def match(
         pictures: folder of the frames.
         names: of the frames' files, in the order of time.
         features: folder of their features.
+        masks: folder of their masks; features on what moves are left out.
         camera_model: COLMAP's name of the lens that all share.
         focal: focal length that the camera has noted [px], or None.
         pairs: indices of the frames to compare.
@@ -57,7 +60,7 @@ def match(
         database, pictures, camera_mode=colmap.CameraMode.SINGLE,
         image_names=list(names), options=reader,
     )  # fmt: skip
-    _write_features(colmap, database, features, focal)
+    _write_features(colmap, database, features, masks, focal)
     verification = colmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = seed
     for begin in range(0, len(pairs), PAIRS_AT_ONCE):
@@ -73,10 +76,14 @@ def match(
         _tell(begin + len(chosen), len(pairs))
 
 
-def _write_features(colmap: Any, database: Path, folder: str, focal: float | None) -> None:
+def _write_features(
+    colmap: Any, database: Path, folder: str, masks: str | None, focal: float | None
+) -> None:
     with colmap.Database.open(database) as opened:
         for image in opened.read_all_images():
             found = read_features(Path(folder), image.name)
+            if masks is not None:
+                found = standing(found, read_mask(Path(masks) / image.name))
             kind = colmap.FeatureExtractorType.SIFT
             described = colmap.FeatureDescriptors(type=kind, data=found.descriptors)
             opened.write_keypoints(image.image_id, found.pixels)
@@ -148,6 +155,7 @@ def _tell(done: int, total: int) -> None:
 
 def main() -> None:
     """Do the job that the command line names, with the arguments that follow as JSON."""
+    end_with_parent()
     job, arguments = sys.argv[1], json.loads(sys.argv[2])
     jobs: dict[str, Callable[..., None]] = {"match": match, "map": map_frames}
     try:

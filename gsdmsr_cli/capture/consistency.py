@@ -1,4 +1,4 @@
-"""Which share of what was matched agrees with the cameras: the rest moves, or is a mistake."""
+"""Which share of what was matched moves, as far as the cameras tell."""
 
 from __future__ import annotations
 
@@ -17,24 +17,40 @@ Floats = NDArray[np.float64]
 GAPS = (2, 4, 8)
 """Frames so far apart in time are compared."""
 
-OFF = 3.0
-"""A match disagrees if it is so far from its epipolar lines (Sampson's distance) [px]."""
+OFF = 0.003
+"""A match disagrees if it is so far from its epipolar lines (Sampson's distance), as a share of the
+picture's longer side; but never nearer than ``LEAST_OFF`` [px]."""
+
+LEAST_OFF = 1.5
+
+NEIGHBOURS = 4
+"""A match is compared with so many others that begin near it."""
+
+ALIKE = 0.25
+"""They move as it does if their shifts differ by less than this share of it, and ``LEAST_OFF``."""
+
+WIDEST = 5.0
+"""No ray is farther than this from the axis, at depth 1: polynomials of lenses explode there."""
 
 _STEPS = 20
 
 
-def disagreeing_share(matches: Path, found: Reconstruction) -> float:
+def moving_share(matches: Path, found: Reconstruction) -> float:
     """Return the share of matches, before they were verified, that no standing point explains.
+
+    Only those count that move as their neighbours do; the others are mistakes of the matcher.
 
     Args:
         matches: folder of the database.
         found: the cameras.
     """
     total = off = 0
+    limit = max(OFF * max(found.lens.width, found.lens.height), LEAST_OFF)
     with load_pycolmap().Database.open(matches / DATABASE) as database:
         images = {image.name: image.image_id for image in database.read_all_images()}
         ids = [images[name] for name in found.names]
-        rays = [rays_of(found.lens, database.read_keypoints(i)[:, :2]) for i in ids]
+        pixels = [database.read_keypoints(i)[:, :2] for i in ids]
+        rays = [rays_of(found.lens, places) for places in pixels]
         for first, second in _pairs(len(ids)):
             if not database.exists_matches(ids[first], ids[second]):
                 continue
@@ -43,8 +59,28 @@ def disagreeing_share(matches: Path, found: Reconstruction) -> float:
             one, other = rays[first][pairs[:, 0]], rays[second][pairs[:, 1]]
             distances = found.lens.fx * sampson_distance(essential, one, other)
             total += len(pairs)
-            off += int((distances > OFF).sum())
+            shifts = pixels[second][pairs[:, 1]] - pixels[first][pairs[:, 0]]
+            off += int(coherent(pixels[first][pairs[:, 0]], shifts, distances > limit).sum())
     return off / max(total, 1)
+
+
+def coherent(
+    places: NDArray[np.float32], shifts: NDArray[np.float32], asked: NDArray[np.bool_]
+) -> NDArray[np.bool_]:
+    """Return for each match that is asked for whether most of its neighbours move as it does.
+
+    Args:
+        places: (N, 2) where the matches begin [px].
+        shifts: (N, 2) how far they go [px].
+        asked: (N,) those asked for.
+    """
+    if len(places) <= NEIGHBOURS or not asked.any():
+        return np.zeros(int(asked.sum()), np.bool_)
+    apart = ((places[asked, None] - places[None]) ** 2).sum(axis=2)
+    nearest = np.argpartition(apart, NEIGHBOURS, axis=1)[:, : NEIGHBOURS + 1]  # and itself
+    differences = np.linalg.norm(shifts[nearest] - shifts[asked, None], axis=2)
+    alike = differences < ALIKE * np.linalg.norm(shifts[asked], axis=1)[:, None] + LEAST_OFF
+    return np.asarray(alike.sum(axis=1) - 1 > NEIGHBOURS / 2, dtype=np.bool_)
 
 
 def _pairs(count: int) -> list[tuple[int, int]]:
@@ -58,7 +94,7 @@ def rays_of(lens: Lens, pixels: NDArray[np.float32]) -> Floats:
     rays: Floats = (target - centre) / focal
     for _ in range(_STEPS):  # a fixed point: lenses bend little
         shown = np.stack(lens.project(rays[:, 0], rays[:, 1]), axis=1)
-        rays = rays - (shown - target) / focal
+        rays = np.clip(rays - (shown - target) / focal, -WIDEST, WIDEST)
     return rays
 
 

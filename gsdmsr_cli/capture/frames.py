@@ -66,6 +66,7 @@ class Frames:
         of_pictures: whether each is a file of its own, not a part of a video.
         in_seconds: whether times are seconds.
         size: width and height [px].
+        original_size: before they were shrunk [px].
         focal: focal length that the camera has noted [px], or None.
         blurred: those that were left out because they are blurred.
     """
@@ -76,6 +77,7 @@ class Frames:
     of_pictures: bool
     in_seconds: bool
     size: tuple[int, int]
+    original_size: tuple[int, int]
     focal: float | None
     blurred: tuple[Candidate, ...]
 
@@ -108,17 +110,18 @@ def write_frames(folder: Path, source: Source, count: int, max_side: int, tell: 
         )
     (folder / _PICTURES).mkdir()
     names = tuple(f"{i:05d}.png" for i in range(len(taken)))
-    sizes = []
+    original_sizes = []
     for i, picture in enumerate(_pictures(source, taken, notes)):
         shrunk = _shrunk(picture, max_side)
-        sizes.append((shrunk.shape[1], shrunk.shape[0]))
-        if sizes[-1] != sizes[0]:
+        original_sizes.append((picture.shape[1], picture.shape[0]))
+        if original_sizes[-1] != original_sizes[0]:
             raise DataError(
                 f"{source.root}: {taken[i].file} is {_size(picture)} px, unlike {taken[0].file}; "
                 "all must have one size: they share one lens"
             )
         write_png(folder / _PICTURES / names[i], shrunk)
         tell(len(candidates) + i + 1, len(candidates) + len(taken))
+    size = shrunk.shape[1], shrunk.shape[0]
     focals = {note.focal for note in notes.values()}
     focal = focals.pop() if len(focals) == 1 else None
     write_json(
@@ -128,8 +131,9 @@ def write_frames(folder: Path, source: Source, count: int, max_side: int, tell: 
             "blurred": [asdict(frame) for frame in blurred],
             "of_pictures": source.kind == "images",
             "in_seconds": in_seconds,
-            "size": sizes[0],
-            "focal": None if focal is None else focal * math.hypot(*sizes[0]),
+            "size": size,
+            "original_size": original_sizes[0],
+            "focal": None if focal is None else focal * math.hypot(*size),
         },
     )
 
@@ -145,6 +149,7 @@ def read_frames(folder: Path) -> Frames:
         of_pictures=note["of_pictures"],
         in_seconds=note["in_seconds"],
         size=(note["size"][0], note["size"][1]),
+        original_size=(note["original_size"][0], note["original_size"][1]),
         focal=note["focal"],
         blurred=tuple(Candidate(**frame) for frame in note["blurred"]),
     )

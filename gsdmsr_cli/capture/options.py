@@ -23,6 +23,7 @@ class Options:
         camera_model: COLMAP's name of the lens that all frames share.
         matching: which frames are compared: neighbours in time, all, or neighbours and, of a few
             evenly chosen, all; ``auto`` is exhaustive for small folders of pictures.
+        auto_mask: whether what moves is looked for, with the cameras of a first pass.
         mapping: COLMAP's incremental mapper or its global one.
         min_registered: share of the frames whose cameras must be found.
         test_every: every so many frames one is kept for testing; 0 keeps none.
@@ -34,6 +35,7 @@ class Options:
     features: int = 2048
     camera_model: str = "SIMPLE_RADIAL"
     matching: str = "auto"
+    auto_mask: bool = False
     mapping: str = "incremental"
     min_registered: float = 0.75
     test_every: int = 8

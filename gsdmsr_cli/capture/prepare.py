@@ -5,17 +5,21 @@ from __future__ import annotations
 import shutil
 from collections.abc import Callable
 from contextlib import AbstractContextManager
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from gsdmsr_cli import __version__
 from gsdmsr_cli.capture import write
 from gsdmsr_cli.capture.child import run_child
-from gsdmsr_cli.capture.consistency import disagreeing_share
+from gsdmsr_cli.capture.consistency import moving_share
 from gsdmsr_cli.capture.features import write_features
 from gsdmsr_cli.capture.frames import Frames, read_frames, write_frames
+from gsdmsr_cli.capture.masks import digest, write_given_masks
+from gsdmsr_cli.capture.motion import write_found_masks
 from gsdmsr_cli.capture.options import Options
 from gsdmsr_cli.capture.pairs import choose_pairs
 from gsdmsr_cli.capture.quality import assess
@@ -25,7 +29,6 @@ from gsdmsr_cli.capture.settle import settle
 from gsdmsr_cli.capture.source import Source
 from gsdmsr_cli.capture.stages import Stages
 from gsdmsr_cli.errors import DataError
-from gsdmsr_cli.machine import versions
 
 Tell = Callable[[int, int], None]
 Watch = Callable[[str], AbstractContextManager[Tell]]
@@ -37,73 +40,137 @@ TRUSTED = 3
 """Points that fewer frames have found do not become points to start from."""
 
 
-def prepare(source: Source, options: Options, stages: Stages, watch: Watch) -> Path:
+@dataclass(frozen=True)
+class Masks:
+    """Masks that a user gives: a folder of pictures, white where something moves, or black."""
+
+    folder: Path
+    inverted: bool = False
+
+
+def prepare(
+    source: Source, masks: Masks | None, options: Options, stages: Stages, watch: Watch
+) -> Path:
     """Return the folder of the finished scene, among the stages.
 
     Raises:
         DataError: the source cannot be used; the message says why.
     """
-    with watch("reading the source"):
-        digest = source.digest()
-    key: dict[str, Any] = {
-        "source": digest, "kind": source.kind, "frames": options.frames,
-        "max_side": options.max_side, "version": versions()["gsdmsr"],
-    }  # fmt: skip
-
-    def make_frames(folder: Path) -> None:
-        with watch("choosing frames") as tell:
-            write_frames(folder, source, options.frames, options.max_side, tell)
-
-    frames = read_frames(stages.run("frames", key, make_frames))
-    key |= {"features": options.features}
-
-    def make_features(folder: Path) -> None:
-        with watch("finding features") as tell:
-            pictures = [frames.folder / name for name in frames.names]
-            write_features(folder, pictures, options.features, tell)
-
-    features = stages.run("features", key, make_features)
-    key |= {
-        "camera_model": options.camera_model,
-        "matching": options.matching,
-        "seed": options.seed,
-    }
-
-    def make_matches(folder: Path) -> None:
-        with watch("matching frames") as tell:
-            pairs = choose_pairs(len(frames.names), options.matching, source.kind == "video")
-            arguments = {
-                "out": str(folder), "pictures": str(frames.folder), "names": frames.names,
-                "features": str(features), "camera_model": options.camera_model,
-                "focal": frames.focal, "pairs": pairs, "seed": options.seed,
-            }  # fmt: skip
-            run_child("match", arguments, tell)
-
-    matches = stages.run("matches", key, make_matches)
-    key |= {"mapping": options.mapping}
-
-    def make_model(folder: Path) -> None:
-        with watch("finding cameras") as tell:
-            arguments = {
-                "matches": str(matches), "pictures": str(frames.folder), "out": str(folder),
-                "mapping": options.mapping, "seed": options.seed, "count": len(frames.names),
-            }  # fmt: skip
-            run_child("map", arguments, tell)
-
-    found = read_reconstruction(stages.run("model", key, make_model))
+    work = _Work(source, options, stages, watch)
+    frames, features = work.find_frames()
+    moving, masked_by = None, "nothing"
+    if masks is not None:
+        moving, masked_by = work.take_masks(masks, frames), "given"
+    elif options.auto_mask:
+        _, first = work.find_cameras(frames, features, None)
+        moving, masked_by = work.find_masks(frames, first), "found"
+    matches, found = work.find_cameras(frames, features, moving)
     require_registered(frames, found, options.min_registered)
-    quality = assess(frames, found, disagreeing_share(matches, found))
+    quality = assess(frames, found, moving_share(matches, found), masked_by, moving)
     provenance = {
-        "input": {"name": source.root.name, "kind": source.kind, "sha256": digest},
+        "input": {"name": source.root.name, "kind": source.kind, "sha256": work.key["source"]},
+        "masks": masked_by,
         "options": asdict(options),
-        "versions": versions(),
+        "versions": work.key["versions"],
     }
 
-    def make_scene(folder: Path) -> None:
+    def make(folder: Path) -> None:
         with watch("writing the scene") as tell:
-            _write_scene(folder, frames, found, options, provenance, quality, tell)
+            _write_scene(folder, frames, moving, found, options, provenance, quality, tell)
 
-    return stages.run("scene", key | {"test_every": options.test_every}, make_scene)
+    return work.run("scene", make, test_every=options.test_every)
+
+
+def _versions() -> dict[str, str]:
+    """Return the versions of all that what is written depends on."""
+    packages = ("numpy", "opencv-contrib-python-headless", "OpenImageIO", "pycolmap")
+    return {"gsdmsr": __version__, **{name: metadata.version(name) for name in packages}}
+
+
+class _Work:
+    """The stages, each of which depends on those before it.
+
+    ``key`` holds all that the next stage depends on.
+    """
+
+    def __init__(self, source: Source, options: Options, stages: Stages, watch: Watch) -> None:
+        self.source, self.options, self.stages, self.watch = source, options, stages, watch
+        with watch("reading the source"):
+            self.key: dict[str, Any] = {"source": source.digest(), "kind": source.kind}
+        self.key["versions"] = _versions()
+
+    def run(self, name: str, make: Callable[[Path], None], **more: Any) -> Path:
+        """Return the stage's folder; from now on everything depends on ``more`` as well."""
+        self.key |= more
+        return self.stages.run(name, self.key, make)
+
+    def find_frames(self) -> tuple[Frames, Path]:
+        """Return the frames and the folder of their features."""
+        options = self.options
+
+        def choose(folder: Path) -> None:
+            with self.watch("choosing frames") as tell:
+                write_frames(folder, self.source, options.frames, options.max_side, tell)
+
+        def find(folder: Path) -> None:
+            with self.watch("finding features") as tell:
+                pictures = [frames.folder / name for name in frames.names]
+                write_features(folder, pictures, options.features, tell)
+
+        chosen = self.run("frames", choose, frames=options.frames, max_side=options.max_side)
+        frames = read_frames(chosen)
+        return frames, self.run("features", find, features=options.features)
+
+    def take_masks(self, masks: Masks, frames: Frames) -> Path:
+        """Return the folder of the frames' masks, from those that a user gives."""
+
+        def take(folder: Path) -> None:
+            with self.watch("reading masks") as tell:
+                given = masks.folder, masks.inverted
+                write_given_masks(folder, *given, self.source, frames, tell)
+
+        return self.run("masks", take, masks=digest(masks.folder, masks.inverted))
+
+    def find_masks(self, frames: Frames, first: Reconstruction) -> Path:
+        """Return the folder of masks of what disagrees with the cameras of a first pass."""
+
+        def find(folder: Path) -> None:
+            with self.watch("finding what moves") as tell:
+                write_found_masks(folder, frames, first, tell)
+
+        return self.run("masks", find, masks="found")
+
+    def find_cameras(
+        self, frames: Frames, features: Path, masks: Path | None
+    ) -> tuple[Path, Reconstruction]:
+        """Return the folder of the matches and what was made of them."""
+        options = self.options
+
+        def match(folder: Path) -> None:
+            with self.watch("matching frames") as tell:
+                video = not frames.of_pictures
+                arguments = {
+                    "out": str(folder), "pictures": str(frames.folder), "names": frames.names,
+                    "features": str(features), "masks": None if masks is None else str(masks),
+                    "camera_model": options.camera_model, "focal": frames.focal,
+                    "pairs": choose_pairs(len(frames.names), options.matching, video),
+                    "seed": options.seed,
+                }  # fmt: skip
+                run_child("match", arguments, tell)
+
+        def find(folder: Path) -> None:
+            with self.watch("finding cameras") as tell:
+                arguments = {
+                    "matches": str(matches), "pictures": str(frames.folder), "out": str(folder),
+                    "mapping": options.mapping, "seed": options.seed, "count": len(frames.names),
+                }  # fmt: skip
+                run_child("map", arguments, tell)
+
+        matches = self.run(
+            "matches", match, camera_model=options.camera_model, matching=options.matching,
+            seed=options.seed,
+        )  # fmt: skip
+        return matches, read_reconstruction(self.run("model", find, mapping=options.mapping))
 
 
 def require_registered(frames: Frames, found: Reconstruction, least: float) -> None:
@@ -126,6 +193,7 @@ def require_registered(frames: Frames, found: Reconstruction, least: float) -> N
 def _write_scene(
     folder: Path,
     frames: Frames,
+    masks: Path | None,
     found: Reconstruction,
     options: Options,
     provenance: dict[str, Any],
@@ -134,6 +202,8 @@ def _write_scene(
 ) -> None:
     when = dict(zip(frames.names, frames.times, strict=True))
     views, points, bound = settle(found, [when[n] for n in found.names], options.test_every)
+    if masks is not None:
+        views = write.write_masks(folder, masks, views, found.lens)
     write.write_pictures(folder, frames.folder, views, found.lens, tell)
     write.write_transforms(folder / "transforms.json", views, POINTS)
     trusted = found.tracks >= TRUSTED

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gsdmsr_cli.capture.frames import Frames
+from gsdmsr_cli.capture.masks import NOTE, read_mask
 from gsdmsr_cli.capture.reconstruction import Reconstruction
+from gsdmsr_cli.files import read_json
 
 Floats = NDArray[np.float64]
 
@@ -24,17 +27,27 @@ FIELD_OF_VIEW = 25.0, 110.0
 FOCAL_RATIO = 1.15
 """Of the focal length that was found and the one that the camera has noted, either way round."""
 
-MOVING = 0.2
+COVERED = 0.6
+"""Share of the pictures that masks may cover without a warning."""
+
+DISTORTION = 0.03
+"""How far a lens may move the corner without a warning, as a share of the picture's diagonal."""
+
+MOVING = 0.1
 """Share of the matches that agree with no standing point beyond which something large moves."""
 
 
-def assess(frames: Frames, found: Reconstruction, moving: float) -> dict[str, Any]:
+def assess(
+    frames: Frames, found: Reconstruction, moving: float, masked_by: str, masks: Path | None
+) -> dict[str, Any]:
     """Return the report, fit for JSON.
 
     Args:
         frames: all that were chosen.
         found: what became of them.
         moving: share of matches that disagree with the cameras.
+        masked_by: where masks come from: "given", "found" or "nothing".
+        masks: folder of the frames' masks.
     """
     parallax = parallaxes(found)
     width, height = found.lens.width, found.lens.height
@@ -57,12 +70,26 @@ def assess(frames: Frames, found: Reconstruction, moving: float) -> dict[str, An
             "noted_px": frames.focal,
         },
         "corner_distortion_px": _corner_distortion(found),
+        "diagonal_px": math.hypot(width, height),
         "parallax_deg": float(np.median(parallax)) if len(parallax) else 0.0,
         "path_over_depth": _path_over_depth(found),
         "moving_matches": moving,
+        "masks": _mask_report(frames, masked_by, masks),
     }
     report["warnings"] = warnings(report)
     return report
+
+
+def _mask_report(frames: Frames, masked_by: str, masks: Path | None) -> dict[str, Any]:
+    if masks is None:
+        return {"from": masked_by, "covered": 0.0, "most_covered": 0.0, "frames_without": []}
+    shares = [float(read_mask(masks / name).mean()) for name in frames.names]
+    return {
+        "from": masked_by,
+        "covered": float(np.mean(shares)),
+        "most_covered": max(shares),
+        "frames_without": read_json(masks / NOTE)["missing"],
+    }
 
 
 def _dropped(frames: Frames, found: Reconstruction) -> list[str]:
@@ -136,9 +163,15 @@ def warnings(report: Mapping[str, Any]) -> list[str]:
         )
     if report["moving_matches"] > MOVING:
         found.append(
-            f"{100 * report['moving_matches']:.0f} % of what was found in two frames does not "
-            "agree with the cameras: something large moves, and the cameras may be wrong; film it "
-            "smaller in the picture, before a background with texture"
+            f"{100 * report['moving_matches']:.0f} % of what was found in two frames moves, as far "
+            "as the cameras tell: something large does, or the cameras are wrong; give --masks of "
+            "it, or try --auto-mask"
+        )
+    if report["corner_distortion_px"] > DISTORTION * report["diagonal_px"]:
+        found.append(
+            f"the lens bends the corner by {report['corner_distortion_px']:.0f} px, more than "
+            "cameras do: unless it is a fisheye (--camera-model OPENCV_FISHEYE), something large "
+            "moves and the cameras are wrong; give --masks of it, or try --auto-mask"
         )
     if report["parallax_deg"] < PARALLAX:
         found.append(
@@ -156,7 +189,22 @@ def warnings(report: Mapping[str, Any]) -> list[str]:
             f"a frame sees only {report['fewest_points_in_a_frame']} of the points: its camera may "
             "be off; keep something with texture in the picture"
         )
-    return found + _focal_warnings(focal)
+    return found + _mask_warnings(report["masks"]) + _focal_warnings(focal)
+
+
+def _mask_warnings(masks: Mapping[str, Any]) -> list[str]:
+    found = []
+    if masks["frames_without"]:
+        found.append(
+            f"{len(masks['frames_without'])} frames have no mask, such as "
+            f"{masks['frames_without'][0]}: there nothing is taken to move"
+        )
+    if masks["covered"] > COVERED:
+        found.append(
+            f"masks cover {100 * masks['covered']:.0f} % of the pictures: little is left to find "
+            "cameras from; is white what moves? --invert-masks takes black for it"
+        )
+    return found
 
 
 def _focal_warnings(focal: Mapping[str, Any]) -> list[str]:

@@ -50,8 +50,12 @@ def rows(quality: Mapping[str, Any]) -> list[tuple[str, str]]:
             f"{quality['parallax_deg']:.1f} degrees; the path is "
             f"{quality['path_over_depth']:.2f} times as long as the scene is deep",
         ),
-        ("matches that disagree", f"{100 * quality['moving_matches']:.0f} %"),
+        ("matches that move", f"{100 * quality['moving_matches']:.0f} %"),
     ]
+    masks = quality["masks"]
+    if masks["from"] != "nothing":
+        share = f"{100 * masks['covered']:.0f} % of the pictures"
+        table.append(("masks cover", f"{share}, at most {100 * masks['most_covered']:.0f} %"))
     if frames["dropped"]:
         table.insert(1, ("frames without one", _listed(frames["dropped"])))
     return table

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsdmsr_cli.camera import Camera
+from gsdmsr_cli.capture.masks import read_mask, write_mask
 from gsdmsr_cli.files import replacing, write_json
 from gsdmsr_cli.imaging import read_image, resample, write_png
 from gsdmsr_cli.lens import Lens
@@ -37,6 +39,19 @@ def write_pictures(
         picture = read_image(pictures / view.image_path.name)
         write_png(target, picture if lens.is_pinhole else undistorted(picture, lens))
         tell(done, len(views))
+
+
+def write_masks(folder: Path, masks: Path, views: Sequence[View], lens: Lens) -> tuple[View, ...]:
+    """Undistort masks of what moves to ``folder``; return the views with them."""
+    masked = []
+    for view in views:
+        target = Path("masks") / view.image_path.name
+        (folder / target).parent.mkdir(exist_ok=True)
+        moving = read_mask(masks / view.image_path.name)[..., None].astype(np.uint8) * 255
+        straight = moving if lens.is_pinhole else undistorted(moving, lens)
+        write_mask(folder / target, straight.reshape(moving.shape[:2]) >= 128)
+        masked.append(replace(view, moving_path=target))
+    return tuple(masked)
 
 
 def undistorted(picture: NDArray[np.uint8], lens: Lens) -> NDArray[np.uint8]:

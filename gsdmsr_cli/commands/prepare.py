@@ -14,7 +14,7 @@ from rich.console import Console
 from rich.table import Table
 
 from gsdmsr_cli.capture.options import Options
-from gsdmsr_cli.capture.prepare import prepare, publish
+from gsdmsr_cli.capture.prepare import Masks, prepare, publish
 from gsdmsr_cli.capture.report import rows
 from gsdmsr_cli.capture.source import find_source
 from gsdmsr_cli.capture.stages import Stages
@@ -28,9 +28,26 @@ TIMINGS = "timings.json"
 
 
 def run(
-    given: Path, out: Path, kind: str | None, options: Options, overwrite: bool, as_json: bool
+    given: Path,
+    out: Path,
+    kind: str | None,
+    masks: Masks | None,
+    options: Options,
+    overwrite: bool,
+    keep: bool,
+    as_json: bool,
 ) -> None:
     """Write the scene folder ``out`` and print the report on its cameras.
+
+    Args:
+        given: a video, or a folder of pictures or videos.
+        out: the scene folder.
+        kind: what ``given`` is, where it is not plain.
+        masks: of what moves.
+        options: how the scene is made.
+        overwrite: whether ``out`` may hold an earlier scene, which is replaced.
+        keep: whether stages are kept for a run with other options.
+        as_json: whether one JSON object is printed instead of a table.
 
     Raises:
         UsageError: ``out`` is in use.
@@ -41,7 +58,7 @@ def run(
     stages = Stages(out.with_name(f"{out.name}.stages"))
     clock = _Clock()
     try:
-        scene = prepare(find_source(given, kind), options, stages, clock.watch)
+        scene = prepare(find_source(given, kind), masks, options, stages, clock.watch)
     except KeyboardInterrupt:
         if stages.root.is_dir():
             text = f"interrupted; finished stages are kept in {shlex.quote(str(stages.root))}"
@@ -49,7 +66,8 @@ def run(
         raise
     write_json(scene / TIMINGS, {"seconds": clock.seconds, "given": str(given.resolve())})
     publish(scene, out)
-    stages.remove()
+    if not keep:
+        stages.remove()
     note = read_json(out / NOTE)
     if as_json:
         Console().out(json.dumps(note | {"seconds": clock.seconds}, indent=2), highlight=False)

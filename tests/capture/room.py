@@ -122,7 +122,7 @@ def write_film(path: Path, shots: Shots, fps: float = 10.0) -> Path:
 
 
 def trajectory_error(centres: np.ndarray, true: np.ndarray) -> float:
-    """Return the RMS distance after the best similarity (Umeyama 1991), over the path's length."""
+    """Root mean square distance after the best similarity (Umeyama 1991), over the length."""
     a, b = centres - centres.mean(0), true - true.mean(0)
     u, s, vt = np.linalg.svd(b.T @ a)
     flip = np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])

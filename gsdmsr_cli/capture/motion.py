@@ -1,0 +1,113 @@
+"""Finds what moves, where the flow between frames disagrees with cameras found without masks."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gsdmsr_cli.capture.consistency import essential_matrix, rays_of, sampson_distance
+from gsdmsr_cli.capture.frames import Frames
+from gsdmsr_cli.capture.masks import NOTE, Mask, write_mask
+from gsdmsr_cli.capture.reconstruction import Reconstruction
+from gsdmsr_cli.files import write_json
+from gsdmsr_cli.native import cv2
+
+LONGEST = 640
+"""Longer side at which flow is computed [px]."""
+
+NEIGHBOURS = (-4, -2, 2, 4)
+"""Each frame is compared with these, counted in frames."""
+
+OFF = 1.5
+"""What is so far from its epipolar line moves [px at ``LONGEST``]."""
+
+INCONSISTENT = 1.5
+"""Flow there and back that ends so far from its start is not to be trusted [px]."""
+
+SMALLEST = 0.002
+"""Smaller patches, as shares of the picture, are mistakes."""
+
+Grey = NDArray[np.uint8]
+Floats32 = NDArray[np.float32]
+
+
+def write_found_masks(
+    folder: Path, frames: Frames, found: Reconstruction, tell: Callable[[int, int], None]
+) -> None:
+    """Write a mask for every frame, empty where it has no camera.
+
+    Args:
+        folder: to write.
+        frames: the chosen ones.
+        found: cameras of a first pass.
+        tell: called with how many are done, and of how many.
+    """
+    scale = min(1.0, LONGEST / max(frames.size))
+    width, height = (round(side * scale) for side in frames.size)
+    greys = [_grey(frames.folder / name, width, height) for name in found.names]
+    pixels = np.stack(np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), axis=-1)
+    lens = found.lens.resized(width, height)
+    rays = rays_of(lens, pixels.reshape(-1, 2).astype(np.float32)).reshape(height, width, 2)
+    masks = {}
+    for i, name in enumerate(found.names):
+        others = [i + step for step in NEIGHBOURS if 0 <= i + step < len(greys)]
+        votes = [
+            _off_lines(greys[i], greys[j], rays, essential_matrix(found.poses[i], found.poses[j]))
+            for j in others
+        ]
+        masks[name] = _cleaned(np.mean(votes, axis=0) * lens.fx > OFF)
+        tell(i + 1, len(found.names))
+    for name in frames.names:
+        small = masks.get(name, np.zeros((height, width), bool))
+        large = cv2.resize(small.astype(np.uint8), frames.size, interpolation=cv2.INTER_NEAREST)
+        write_mask(folder / name, np.asarray(large) > 0)
+    write_json(folder / NOTE, {"missing": [n for n in frames.names if n not in masks]})
+
+
+def _grey(path: Path, width: int, height: int) -> Grey:
+    picture = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+    assert picture is not None
+    return np.asarray(cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
+
+
+def _off_lines(
+    here: Grey, there: Grey, rays: NDArray[np.float64], essential: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return how far each pixel's flow ends from its epipolar line, (H, W), in units of rays.
+
+    0 where the flow is not to be trusted.
+    """
+    height, width = here.shape
+    forward, back = _flow(here, there), _flow(there, here)
+    columns, rows = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height))
+    to_x = columns + forward[..., 0]
+    to_y = rows.astype(np.float32) + forward[..., 1]
+    returned = forward + cv2.remap(back, to_x, to_y, cv2.INTER_LINEAR)
+    inside = (to_x >= 0) & (to_x <= width - 1) & (to_y >= 0) & (to_y <= height - 1)
+    trusted = inside & (np.linalg.norm(returned, axis=2) < INCONSISTENT)
+    seen = cv2.remap(rays.astype(np.float32), to_x, to_y, cv2.INTER_LINEAR)
+    distances = sampson_distance(
+        essential, rays.reshape(-1, 2), np.asarray(seen, np.float64).reshape(-1, 2)
+    )
+    return np.where(trusted, distances.reshape(height, width), 0.0)
+
+
+def _flow(here: Grey, there: Grey) -> Floats32:
+    dis = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+    return np.asarray(dis.calc(here, there, None), dtype=np.float32)  # type: ignore[call-overload]
+
+
+def _cleaned(moving: Mask) -> Mask:
+    """Return the mask without specks and without small holes."""
+    height, width = moving.shape
+    size = max(3, round(0.012 * max(height, width))) | 1
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
+    opened = cv2.morphologyEx(moving.astype(np.uint8), cv2.MORPH_OPEN, disc)
+    closed = cv2.morphologyEx(opened, cv2.MORPH_CLOSE, disc, iterations=2)
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(closed)
+    large = stats[:, cv2.CC_STAT_AREA] >= SMALLEST * height * width
+    large[0] = False
+    return np.asarray(large[labels], dtype=np.bool_)
