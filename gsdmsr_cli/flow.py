@@ -36,10 +36,10 @@ def draw_flow(
     scale = max(float(moved.abs().max()) if len(moved) else 0.0, 1e-6)
     # engines clamp colours at 0, so displacements go to [0, 1] and back: with weights w that sum
     # to alpha, sum w (d / s + 1) / 2 = (sum w d / s + alpha) / 2
-    colours = torch.full((len(moved), 3), 0.5)
+    colours = moved.new_full((len(moved), 3), 0.5)
     colours[:, :2] = (moved / scale + 1) / 2
     coloured = replace(splats, sh=((colours - 0.5) / SH_C0)[:, None, :])
-    frame = engine.rasterize(coloured, camera, torch.zeros(3))
+    frame = engine.rasterize(coloured, camera, moved.new_zeros(3))
     alpha = frame.alpha[..., None]
     blended = scale * (2 * frame.rgb[..., :2] - alpha)
     return torch.where(alpha > ALPHA_MIN, blended / alpha.clamp(min=ALPHA_MIN), 0.0)

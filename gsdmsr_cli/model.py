@@ -109,11 +109,18 @@ class Model:
         fresh = still[: self.moving]
         for name, tensor in self.splats.tensors().items():
             tensor[: self.moving][fresh] = getattr(where, name)[: self.moving][fresh]
-        settled = torch.arange(len(self.splats)) >= self.moving
+        settled = torch.arange(len(self.splats), device=still.device) >= self.moving
         settled[: self.moving] |= fresh
         order = settled.to(torch.uint8).argsort(stable=True)
         self._resize(order, len(order) - int(settled.sum()))
         return order
+
+    def to(self, device: torch.device | str) -> Model:
+        """Move everything to a device, in place, and return the model."""
+        for tensor in self.tensors().values():
+            if tensor.device != torch.device(device):
+                torch.utils.swap_tensors(tensor, torch.nn.Parameter(tensor.detach().to(device)))
+        return self
 
     def tensors(self) -> dict[str, Tensor]:
         """Return everything that is trained and saved, by name."""

@@ -210,6 +210,37 @@ def _sources(lens: Lens) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     return lens.sources()
 
 
+class ResidentPictures:
+    """Copies of pictures in the memory of a device, made when they are first asked for.
+
+    Args:
+        device: where; pictures that lie there already are passed on as they are.
+        limit_bytes: memory for copies; what goes beyond it is copied every time.
+    """
+
+    def __init__(self, device: torch.device, limit_bytes: int) -> None:
+        self._device, self._room = device, limit_bytes
+        self._copies: dict[tuple[str, str, int, int], Tensor] = {}
+
+    def load(self, pictures: Pictures | HalvedPictures, view: View) -> Tensor:
+        """Return what ``pictures.load`` does, on the device.
+
+        Raises:
+            DataError: the file cannot be read.
+        """
+        if self._device.type == "cpu":
+            return pictures.load(view)
+        camera = pictures.camera(view)
+        key = view.split, view.name, camera.width, camera.height
+        if key in self._copies:
+            return self._copies[key]
+        copy = pictures.load(view).to(self._device)
+        if copy.nbytes <= self._room:
+            self._room -= copy.nbytes
+            self._copies[key] = copy
+        return copy
+
+
 def _planes(pixels: NDArray[np.float32]) -> Tensor:
     """Return (H, W, 3) pixels in [0, 255] as (3, H, W) uint8."""
     planes = np.rint(pixels).clip(0, 255).astype(np.uint8).transpose(2, 0, 1)

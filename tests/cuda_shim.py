@@ -57,7 +57,7 @@ class Shim:
             return library
         program.write_text(text, encoding="utf-8")
         macros = [f"-D{name}={value}" for name, value in compiler.definitions().items()]
-        line = ["g++", "-std=c++17", "-O1", "-shared", "-fPIC", "-U_FORTIFY_SOURCE", "-w"]
+        line = ["g++", "-std=c++17", "-O2", "-shared", "-fPIC", "-U_FORTIFY_SOURCE", "-w"]
         places = [f"-I{SHIM}", f"-I{compiler.HERE}", "-o", str(library), str(program)]
         done = subprocess.run(
             [*line, *macros, *places], capture_output=True, text=True, check=False

@@ -12,6 +12,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+import torch
 import typer
 
 from gsdmsr_cli import __version__, cli, commands
@@ -292,6 +293,12 @@ def test_usage_errors_are_one_line_and_exit_2(
             PermissionError(errno.EACCES, "Permission denied"),
             3,
             "Permission denied; free space or choose another place",
+        ),
+        (
+            torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB"),
+            3,
+            "the GPU's memory is full; lower --set density.cap=..., raise --downscale, lower --set "
+            "data.cache_mib=..., or use --device cpu",
         ),
         (
             ZeroDivisionError("division by zero"),

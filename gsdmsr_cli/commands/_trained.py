@@ -59,7 +59,8 @@ def open_trained(
     colour = BACKGROUNDS[background or options.background]
     pictures = Pictures(colour, downscale or options.downscale, options.cache_mib << 20)
     device = raster.pick_device("auto")
-    studio = Studio(model, raster.best_engine(device), pictures, torch.tensor(colour))
+    behind = torch.tensor(colour).to(device)
+    studio = Studio(model.to(device), raster.best_engine(device), pictures, behind)
     return Trained(run, checkpoint, scene, studio, device)
 
 

@@ -100,7 +100,7 @@ def _prepare(scene: Scene, options: Preset, device: str) -> Trainer:
         BACKGROUNDS[options.data.background], options.data.downscale, options.data.cache_mib << 20
     )
     _preload(pictures, scene)
-    return Trainer(scene, options, raster.best_engine(device), pictures)
+    return Trainer(scene, options, raster.best_engine(device), pictures, device)
 
 
 def _start_work(trainer: Trainer, device: str) -> float:
@@ -117,7 +117,7 @@ def _start_work(trainer: Trainer, device: str) -> float:
         motion = str(trainer.preset.motion["name"])
         compile_apart(motion, [lambda: warm_up(*given), prepare_helper])
         trainer.hire(prepare_helper)
-    warm_up(*given)
+    warm_up(*given, device)
     trainer.team.wait()
     return time.perf_counter() - started
 

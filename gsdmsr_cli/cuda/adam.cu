@@ -23,11 +23,12 @@ struct Tensors {
 // A grid of blocks by tensors. A multiplier scales the step, not the gradient, to which Adam is
 // indifferent. A row with multiplier 0 keeps its values and moments; the trace gets the steps that
 // all rows would have made with multiplier 1. rest1 and rest2 are 1 - beta1 and 1 - beta2, which float32
-// would round.
+// would round. Nothing at all happens if *loss is not finite; null stands for a loss that is.
 extern "C" __global__ void __launch_bounds__(THREADS) adam(
     const __grid_constant__ Tensors tensors, float beta1, float beta2, float rest1,
-    float rest2, float eps
+    float rest2, float eps, const float *loss
 ) {
+    if (loss && !(fabsf(*loss) <= LARGEST)) return;
     const Tensor &tensor = tensors.of[blockIdx.y];
     for (int k = blockIdx.x * THREADS + threadIdx.x; k < tensor.length; k += gridDim.x * THREADS) {
         float gradient = tensor.gradient[k];

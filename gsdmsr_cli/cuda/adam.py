@@ -50,8 +50,13 @@ class Row(NamedTuple):
     trace: Tensor | None = None
 
 
-def adam(rows: Sequence[Row], beta1: float, beta2: float, eps: float) -> None:
-    """Make all steps in place; tensors are float32, contiguous and on one device."""
+def adam(
+    rows: Sequence[Row], beta1: float, beta2: float, eps: float, loss: Tensor | None = None
+) -> None:
+    """Make all steps in place; tensors are float32, contiguous and on one device.
+
+    If a ``loss``, () float32, is given that is not finite, nothing is moved or written.
+    """
     rows = [row for row in rows if row.values.numel()]
     for start in range(0, len(rows), MOST_TENSORS):
         some = rows[start : start + MOST_TENSORS]
@@ -62,7 +67,7 @@ def adam(rows: Sequence[Row], beta1: float, beta2: float, eps: float) -> None:
         grid = min(blocks(longest, _THREADS), _MOST_BLOCKS), len(some)
         device = some[0].values.device
         betas = beta1, beta2, 1 - beta1, 1 - beta2
-        launch("adam", "adam", grid, _THREADS, packed, *betas, eps, on=device)
+        launch("adam", "adam", grid, _THREADS, packed, *betas, eps, loss, on=device)
 
 
 def _fill(entry: _Tensor, row: Row) -> None:

@@ -6,6 +6,7 @@
 
 #define ALL_LANES 0xffffffffu
 #define WARP 32
+#define LARGEST 3e38f  // what is not at most this is not finite
 #define BLOCK_WIDTH 8  // of the pixels that a warp draws; a tile has 2 x 4 such blocks
 #define BLOCK_HEIGHT 4
 #define LOG2E 1.4426950408889634f

@@ -8,7 +8,6 @@
 #include "harmonics.cuh"
 #include "tiles.cuh"
 
-#define LARGEST 3e38f
 #define LARGEST_DET 1e36f
 #define TINY 1e-24f
 #define NO_DEPTH 0x7fffffff  // sorts behind every depth

@@ -52,9 +52,9 @@ class Studio:
 
     @torch.no_grad()
     def draw(self, view: View) -> Tensor:
-        """Return the drawn picture, (H, W, 3), unclamped."""
+        """Return the drawn picture, (H, W, 3), unclamped, in the memory of the CPU."""
         camera = self.pictures.camera(view)
-        return draw(self.model, camera, view.time, self.engine, self.background).rgb
+        return draw(self.model, camera, view.time, self.engine, self.background).rgb.cpu()
 
     def true(self, view: View) -> Tensor:
         """Return the true picture, (H, W, 3) in [0, 1].

@@ -54,18 +54,31 @@ def measure_speed(
     def move(i: int) -> object:
         return engine.rasterize(model.at(chosen[i][1]), cameras[i], background)
 
-    fps, frames = _rate(move, len(chosen))
+    def wait() -> None:
+        if background.is_cuda:
+            torch.cuda.synchronize()
+
+    fps, frames = _rate(move, len(chosen), wait)
     moved = [model.at(moment) for _, moment in chosen]
-    fps_raster, _ = _rate(lambda i: engine.rasterize(moved[i], cameras[i], background), len(chosen))
+    fps_raster, _ = _rate(
+        lambda i: engine.rasterize(moved[i], cameras[i], background), len(chosen), wait
+    )
     return Speed(fps, fps_raster, frames)
 
 
-def _rate(draw: Callable[[int], object], count: int) -> tuple[float, int]:
-    """Call ``draw`` with 0 to count - 1 in turn; return the calls a second and how many."""
+def _rate(
+    draw: Callable[[int], object], count: int, wait: Callable[[], object]
+) -> tuple[float, int]:
+    """Call ``draw`` with 0 to count - 1 in turn; return the calls a second and how many.
+
+    What has been drawn is there when ``wait`` returns.
+    """
     for i in range(WARM_UP):
         draw(i % count)
+    wait()
     started, frames = time.perf_counter(), 0
     while frames < count or time.perf_counter() - started < SECONDS:
         draw(frames % count)
         frames += 1
+    wait()
     return frames / (time.perf_counter() - started), frames

@@ -156,9 +156,10 @@ class MultiscaleMotion:
         A finite difference in place of the method's |grad_x phi|^2, at some of the splats.
         """
         rows = torch.randint(len(splats), (SMOOTH_ROWS,), generator=generator)
+        rows = rows.to(splats.means.device)
         places = splats.means.detach()[rows]
         reach = self.options.smooth_reach * self.facts.bound
-        beside = places + reach * torch.randn(places.shape, generator=generator)
+        beside = places + reach * torch.randn(places.shape, generator=generator).to(places)
         own = self.embeddings[rows].repeat(2, 1)
         both = replace(splats.take(rows.repeat(2)), means=torch.cat([places, beside]))
         features = self._features(self.coarse + self.fine, both, time, own)

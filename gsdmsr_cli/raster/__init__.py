@@ -17,6 +17,14 @@ and, if it can do both in one go faster than one after the other::
         # what ``training.losses.photometric_loss`` says of the drawn picture; with ssim_weight 0
         # also of some tiles of it, whose shares of the loss are multiplied by their weights
 
+or the same of several views at once::
+
+    def compare_views(splats: Sequence[Splats], cameras: Sequence[Camera], background: Tensor,
+                      targets: Sequence[Tensor], ssim_weight: float, sh_degree: int | None = None,
+                      tile_weights: Sequence[Tensor] | None = None,
+                      ) -> tuple[Tensor, list[Comparison]]
+        # the sum of the losses, and what is to be said of each view; all have one picture size
+
 Gradients reach all five tensors of the splats; ``frame.means2d`` is part of the graph, so that
 ``frame.means2d.retain_grad()`` gives density control its statistic. Every engine is held to
 ``reference`` by tests/raster/test_conformance.py.
@@ -24,6 +32,7 @@ Gradients reach all five tensors of the splats; ``frame.means2d`` is part of the
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple, Protocol, cast, runtime_checkable
 
 from torch import Tensor
@@ -87,6 +96,23 @@ class Comparing(Engine, Protocol):
         """Return what is to be said of the picture."""
 
 
+@runtime_checkable
+class ComparingViews(Engine, Protocol):
+    """An engine that draws and compares several views in one go."""
+
+    def compare_views(
+        self,
+        splats: Sequence[Splats],
+        cameras: Sequence[Camera],
+        background: Tensor,
+        targets: Sequence[Tensor],
+        ssim_weight: float,
+        sh_degree: int | None = None,
+        tile_weights: Sequence[Tensor] | None = None,
+    ) -> tuple[Tensor, list[Comparison]]:
+        """Return the sum of the losses, and what is to be said of each picture."""
+
+
 def load_engine(name: str) -> Engine:
     """Import the engine ``name``.
 
@@ -118,13 +144,14 @@ def best_engine(device: str) -> Engine:
 
 
 def pick_device(wanted: str) -> str:
-    """Return where commands compute: on the CPU, in this version.
+    """Return where to compute, "cpu" or "cuda"; "auto" takes the GPU if the engine can draw there.
 
     Raises:
-        DataError: "cuda" is wanted.
+        DataError: "cuda" is wanted, and the engine cannot draw there.
     """
-    if wanted == "cuda":
-        missing = load_engine("cuda").unavailable("cuda")
-        reason = missing or "commands draw with the CPU engine in this version"
+    if wanted == "cpu":
+        return wanted
+    reason = load_engine("cuda").unavailable("cuda")
+    if reason is not None and wanted == "cuda":
         raise DataError(f"--device cuda: {reason}; use --device cpu")
-    return "cpu"
+    return "cpu" if reason is not None else "cuda"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cache
 from typing import Any
 
 import torch
@@ -15,12 +16,23 @@ from gsdmsr_cli.cuda import stages
 from gsdmsr_cli.cuda.availability import missing
 from gsdmsr_cli.frame import Frame
 from gsdmsr_cli.raster import Comparison
+from gsdmsr_cli.raster._check import disagreement
 from gsdmsr_cli.splats import Splats
 
 
 def unavailable(device: str) -> str | None:
-    """Return why the engine cannot draw on ``device``, or None if it can."""
-    return "it draws tensors that lie in the memory of a GPU" if device == "cpu" else missing()
+    """Return why the engine cannot draw on ``device``, or None if it can.
+
+    What is not missing is tried out once, so that nobody relies on a GPU that draws otherwise.
+    """
+    if device == "cpu":
+        return "it draws tensors that lie in the memory of a GPU"
+    return missing() or _disagreement()
+
+
+@cache
+def _disagreement() -> str | None:
+    return disagreement(rasterize, "cuda")
 
 
 def rasterize(

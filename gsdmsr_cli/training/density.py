@@ -29,22 +29,24 @@ class DensityStatistics:
         views: (N,) number of views that drew the splat.
     """
 
-    def __init__(self, count: int) -> None:
-        self.total = torch.zeros(count)
-        self.views = torch.zeros(count)
+    def __init__(self, count: int, device: torch.device | str = "cpu") -> None:
+        self.total = torch.zeros(count, device=device)
+        self.views = torch.zeros(count, device=device)
 
     @torch.no_grad()
     def observe(self, gradient: Tensor, width: int, height: int) -> None:
         """Add one drawn view.
 
-        Splats that move no pixel, behind opaque ones for instance, do not count as drawn.
+        Splats that move no pixel, behind opaque ones for instance, do not count as drawn, nor do
+        those whose gradient is not finite.
 
         Args:
             gradient: (N, 2) of the view's own loss, by the positions on the screen [1 / px].
             width, height: of the view's picture [px].
         """
-        half = gradient.new_tensor([0.5 * width, 0.5 * height])
-        length = (gradient * half).norm(dim=1)
+        x, y = gradient.unbind(1)
+        scaled = torch.stack([x * (0.5 * width), y * (0.5 * height)], dim=1)
+        length = scaled.norm(dim=1).nan_to_num(0.0, 0.0)
         self.total += length
         self.views += length > 0
 
@@ -95,7 +97,7 @@ def grow_and_prune(
     survivors, clones = kept & ~split, grows & ~split
     children = split.nonzero().flatten().repeat(2)
     rows = torch.cat([survivors.nonzero().flatten(), clones.nonzero().flatten(), children])
-    fresh = torch.arange(len(rows)) >= int(survivors.sum())
+    fresh = torch.arange(len(rows), device=rows.device) >= int(survivors.sum())
     grown = splats.detach().take(rows)
     if len(children):
         _scatter_children(grown, len(children), generator)
@@ -118,7 +120,7 @@ def _scatter_children(grown: Splats, count: int, generator: torch.Generator) -> 
     """Draw the last ``count`` means from their parents' Gaussians and shrink them, in place."""
     children = slice(len(grown) - count, None)
     scales = grown.log_scales[children].exp()
-    noise = torch.randn(count, 3, generator=generator) * scales
+    noise = torch.randn(count, 3, generator=generator).to(scales) * scales
     turned = quat_to_rotmat(grown.quats[children]) @ noise[:, :, None]
     grown.means[children] += turned[:, :, 0]
     grown.log_scales[children] -= math.log(SPLIT_SHRINK)

@@ -1,4 +1,4 @@
-"""One look at one view: draw it, compare it with its picture, take the gradients."""
+"""A look at views: draw them, compare them with their pictures, take the gradients."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from torch import Tensor
 
 from gsdmsr_cli.camera import Camera
 from gsdmsr_cli.model import Model
-from gsdmsr_cli.pictures import HalvedPictures, Pictures
+from gsdmsr_cli.pictures import HalvedPictures, Pictures, ResidentPictures
 from gsdmsr_cli.preset import BACKGROUNDS, Preset
-from gsdmsr_cli.raster import Comparing, Comparison, Engine
+from gsdmsr_cli.raster import Comparing, ComparingViews, Comparison, Engine
 from gsdmsr_cli.scene import View
 from gsdmsr_cli.splats import Splats
 from gsdmsr_cli.splatting_constants import tile_grid
@@ -40,14 +40,15 @@ class Look:
     """What one view has to say.
 
     Attributes:
-        loss: of the view.
-        gradients: of the loss by every tensor of the model, None where it has no part.
+        loss: () of the view, outside the graph.
+        gradients: of the loss by every tensor of the model, None where it has no part. Of views
+            that were looked at together the first has the sum, the others have none.
         on_screen: (N, 2) by the positions on the screen [1 / px].
         size: width and height of the picture [px].
         errors: of each tile, see ``raster.Comparison``.
     """
 
-    loss: float
+    loss: Tensor
     gradients: Sequence[Tensor | None]
     on_screen: Tensor
     size: tuple[int, int]
@@ -58,38 +59,62 @@ class Observer:
     """Looks at views as the preset wants it at each stage of a training.
 
     Attributes:
-        background: (3,) colour behind the splats.
+        background: (3,) colour behind the splats, on the device.
     """
 
-    def __init__(self, preset: Preset, engine: Engine, pictures: Pictures) -> None:
+    def __init__(
+        self,
+        preset: Preset,
+        engine: Engine,
+        pictures: Pictures,
+        device: torch.device | str = "cpu",
+    ) -> None:
         self.preset, self.engine, self.pictures = preset, engine, pictures
-        self.background = torch.tensor(BACKGROUNDS[preset.data.background])
+        self.background = torch.tensor(BACKGROUNDS[preset.data.background]).to(device)
         self._halved = HalvedPictures(pictures)
+        self._resident = ResidentPictures(torch.device(device), preset.data.cache_mib << 20)
 
     def look(
         self,
         model: Model,
-        view: View,
+        views: Sequence[View],
         stage: Stage,
-        tile_weights: Tensor | None = None,
-    ) -> Look:
-        """Return what the view says of the model.
+        tile_weights: Sequence[Tensor | None],
+    ) -> list[Look]:
+        """Return what each of the views says of the model.
 
         Args:
+            model: what is looked at.
+            views: at once, if the engine can and their pictures are of one size.
             stage: of the training.
-            tile_weights: see ``compare``; only where ``tiles`` allows it.
+            tile_weights: of each view, see ``compare``; only where ``tiles`` allows it.
 
         Raises:
-            DataError: the view's picture cannot be read.
+            DataError: a view's picture cannot be read.
         """
         pictures = self._pictures(stage.progress)
-        camera = pictures.camera(view)
-        target, degree = pictures.load(view), self._sh_degree(stage.progress)
-        splats = model.at(view.time, stage.teachers) if stage.moving else model.splats
-        return compare(
-            self.engine, model, splats, camera, self.background, target,
-            self._ssim_weight(stage.progress), degree, tile_weights, pictures.counted(view),
-        )  # fmt: skip
+        cameras = [pictures.camera(view) for view in views]
+        targets = [self._resident.load(pictures, view) for view in views]
+        masks = [pictures.counted(view) for view in views]
+        times = [view.time if stage.moving else None for view in views]
+        weights = [None if own is None else own.to(self.background.device) for own in tile_weights]
+        further = self._ssim_weight(stage.progress), self._sh_degree(stage.progress)
+        together = _alike(cameras, weights) and all(mask is None for mask in masks)
+        if together and isinstance(self.engine, ComparingViews):
+            moved = {time: self._moved(model, time, stage) for time in dict.fromkeys(times)}
+            given = self.engine, model, [moved[time] for time in times], cameras
+            return compare_views(*given, self.background, targets, *further, weights)
+        looks = zip(times, cameras, targets, weights, masks, strict=True)
+        return [
+            compare(
+                self.engine, model, self._moved(model, time, stage), camera, self.background,
+                target, *further, own, mask,
+            )
+            for time, camera, target, own, mask in looks
+        ]  # fmt: skip
+
+    def _moved(self, model: Model, time: float | None, stage: Stage) -> Splats:
+        return model.splats if time is None else model.at(time, stage.teachers)
 
     def tiles(self, view: View, progress: float) -> int:
         """Return how many tiles a view's picture has, or 0 where they may not be chosen."""
@@ -146,7 +171,38 @@ def compare(
     tensors = list(model.tensors().values())
     gradients = torch.autograd.grad(found.loss, tensors, allow_unused=True)
     size = camera.width, camera.height
-    return Look(found.loss.item(), gradients, found.on_screen, size, found.errors)
+    return Look(found.loss.detach(), gradients, found.on_screen, size, found.errors)
+
+
+def compare_views(
+    engine: ComparingViews,
+    model: Model,
+    splats: Sequence[Splats],
+    cameras: Sequence[Camera],
+    background: Tensor,
+    targets: Sequence[Tensor],
+    ssim_weight: float,
+    sh_degree: int | None,
+    tile_weights: Sequence[Tensor | None],
+) -> list[Look]:
+    """Do what ``compare`` does of several views at once."""
+    weights = [own for own in tile_weights if own is not None]
+    loss, found = engine.compare_views(
+        splats, cameras, background, targets, ssim_weight, sh_degree, weights or None
+    )
+    tensors = list(model.tensors().values())
+    gradients = torch.autograd.grad(loss, tensors, allow_unused=True)
+    nothing = [None] * len(tensors)
+    return [
+        Look(own.loss, nothing if i else gradients, own.on_screen, (c.width, c.height), own.errors)
+        for i, (own, c) in enumerate(zip(found, cameras, strict=True))
+    ]
+
+
+def _alike(cameras: Sequence[Camera], tile_weights: Sequence[Tensor | None]) -> bool:
+    """Tell whether views can be looked at together."""
+    sizes = {(camera.width, camera.height) for camera in cameras}
+    return len(sizes) == 1 and len({weights is None for weights in tile_weights}) == 1
 
 
 def draw_and_compare(

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from types import FrameType
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from gsdmsr_cli.evaluation.metrics import PSNR_CAP, psnr, quantize
@@ -125,7 +126,7 @@ class _Watch:
 
     trainer: Trainer
     view: View
-    losses: list[float] = field(default_factory=list)
+    losses: list[Tensor] = field(default_factory=list)
     elapsed: float = 0.0
     progress: float = 0.0
 
@@ -134,7 +135,7 @@ class _Watch:
         clock = self.trainer.clock
         self.losses, self.elapsed, self.progress = [], clock.elapsed, clock.progress
 
-    def count(self, loss: float) -> None:
+    def count(self, loss: Tensor) -> None:
         """Add one step."""
         self.losses.append(loss)
 
@@ -147,9 +148,16 @@ class _Watch:
         )
 
     def report(self) -> Report:
-        """Return the report and begin anew."""
+        """Return the report and begin anew; here a GPU is waited for.
+
+        Raises:
+            GsdmsrError: the training has diverged.
+        """
         clock, model = self.trainer.clock, self.trainer.model
-        finite = [loss for loss in self.losses if math.isfinite(loss)]
+        losses = torch.stack(self.losses).tolist()
+        if self.trainer.device.type != "cpu":
+            self.trainer.count(losses)
+        finite = [loss for loss in losses if math.isfinite(loss)]
         report = Report(
             step=clock.step,
             elapsed=clock.elapsed,

@@ -71,6 +71,7 @@ class Adam:
         tensors: Mapping[str, Tensor],
         rates: Mapping[str, float],
         gates: Mapping[str, Gate] | None = None,
+        loss: Tensor | None = None,
     ) -> None:
         """Move every tensor that has a gradient, and clear the gradient.
 
@@ -79,6 +80,8 @@ class Adam:
             rates: the learning rate of each of them.
             gates: what rows may do, of those tensors that are gated; a trace is left as it is
                 where its tensor has no gradient.
+            loss: () float32, where the gradients come from; on a GPU nothing is moved if it is not
+                finite, so that nobody has to wait for it. Elsewhere the caller looks at it.
         """
         by_kernel: list[Move] = []
         by_cuda: list[Move] = []
@@ -97,7 +100,7 @@ class Adam:
             moves.append(Move(tensor, gradient, *moments, self.steps[name], rates[name], gate))
             tensor.grad = None
         adam_steps(by_kernel)
-        adam_steps_cuda(by_cuda)
+        adam_steps_cuda(by_cuda, loss)
         adam_steps_twin(by_twin)
 
     def take(self, names: Sequence[str], rows: Tensor, fresh: Tensor) -> None:
@@ -149,14 +152,14 @@ def adam_steps(moves: Sequence[Move]) -> None:
     kernels.adam(table, steps, *map(np.float32, (BETA1, BETA2, EPS)))
 
 
-def adam_steps_cuda(moves: Sequence[Move]) -> None:
-    """Make all the moves in place, by one CUDA kernel."""
+def adam_steps_cuda(moves: Sequence[Move], loss: Tensor | None = None) -> None:
+    """Make all the moves in place, by one CUDA kernel, if the loss is finite."""
     rows = []
     for tensor, gradient, first, second, step, rate, gate in moves:
         factors = rate / (1 - BETA1**step), 1 / (1 - BETA2**step)
         gates = (None, None) if gate is None else tuple(gate)
         rows.append(cuda.Row(tensor, gradient, first, second, *factors, *gates))
-    cuda.adam(rows, BETA1, BETA2, EPS)
+    cuda.adam(rows, BETA1, BETA2, EPS, loss)
 
 
 def adam_steps_twin(moves: Sequence[Move]) -> None:

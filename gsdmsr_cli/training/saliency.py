@@ -34,12 +34,14 @@ class Saliency:
         grace: (N,) int64, steps left in which the splat is high whatever its score.
     """
 
-    def __init__(self, count: int, options: SaliencyOptions) -> None:
+    def __init__(
+        self, count: int, options: SaliencyOptions, device: torch.device | str = "cpu"
+    ) -> None:
         self.options = options
-        self.scores = torch.full((count,), options.threshold)
-        self.high = torch.ones(count, dtype=torch.bool)
-        self.age = torch.zeros(count, dtype=torch.int64)
-        self.grace = torch.full((count,), options.grace)
+        self.scores = torch.full((count,), options.threshold, device=device)
+        self.high = torch.ones(count, dtype=torch.bool, device=device)
+        self.age = torch.zeros(count, dtype=torch.int64, device=device)
+        self.grace = torch.full((count,), options.grace, device=device)
 
     def multipliers(self, step: int) -> Tensor:
         """Return the (N,) factors on each splat's update in this step."""

@@ -28,7 +28,7 @@ def motion_saliency(model: Model) -> tuple[Tensor, Splats]:
     moments = [model.at(i / (MOMENTS - 1)) for i in range(MOMENTS)]
     mean = Splats(**{name: _mean(name, moments) for name in NAMES})
     size = mean.log_scales.mean(dim=1).exp()
-    saliency = torch.zeros(len(mean))
+    saliency = mean.means.new_zeros(len(mean))
     for moment in moments:
         parts = (
             (moment.means - mean.means).norm(dim=1) / size,

@@ -139,12 +139,16 @@ class Team:
             self._published.hold(model)
         for helper, share in busy:
             helper.send(model, share, stage)
-        own = [
-            self.observer.look(model, self.views[row], stage, weights) for row, weights in shares[0]
-        ]
+        own = self._look(model, shares[0], stage)
         other = meanwhile()
         looks = [own] + [helper.looks(model) for helper, _ in busy]
         return [looks[i % len(self)][i // len(self)] for i in range(len(rows))], other
+
+    def _look(
+        self, model: Model, share: Sequence[tuple[int, Tensor | None]], stage: Stage
+    ) -> list[Look]:
+        views, tile_weights = [self.views[row] for row, _ in share], [own for _, own in share]
+        return self.observer.look(model, views, stage, tile_weights)
 
     @contextlib.contextmanager
     def all_threads(self) -> Iterator[None]:
@@ -224,7 +228,7 @@ class _Helper:
             ]
             on_screen = shelf.tensor(_ON_SCREEN, (len(model.splats), 2))
             errors = _received(answer.errors)
-            looks.append(Look(answer.loss, gradients, on_screen, answer.size, errors))
+            looks.append(Look(torch.tensor(answer.loss), gradients, on_screen, answer.size, errors))
         return looks
 
     def end(self) -> None:
@@ -271,7 +275,7 @@ class _Desk:
         stage = Stage(task.progress, task.moving, _received(task.teachers))
         answers = []
         for row, sent, shelf in zip(task.views, task.tile_weights, self.answers, strict=False):
-            look = self._observer.look(model, self._views[row], stage, _received(sent))
+            (look,) = self._observer.look(model, [self._views[row]], stage, [_received(sent)])
             answers.append(self._answer(look, shelf))
         return answers
 
@@ -280,7 +284,7 @@ class _Desk:
         gradients[_ON_SCREEN] = look.on_screen
         shelf.write({name: tensor for name, tensor in gradients.items() if tensor is not None})
         there = [tensor is not None for tensor in look.gradients]
-        return _Answer(look.loss, there, look.size, _sent(look.errors))
+        return _Answer(look.loss.item(), there, look.size, _sent(look.errors))
 
 
 def _sent(tensor: Tensor | None) -> NDArray[Any] | None:

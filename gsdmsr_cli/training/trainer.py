@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from statistics import fmean
 
 import torch
 from torch import Tensor
@@ -14,7 +13,7 @@ from gsdmsr_cli.errors import GsdmsrError
 from gsdmsr_cli.model import MOVED_BY, MOVING, STORED, STORED_AS, Model, load_model
 from gsdmsr_cli.motion import start_motion
 from gsdmsr_cli.pictures import Pictures
-from gsdmsr_cli.preset import Preset
+from gsdmsr_cli.preset import BACKGROUNDS, Preset
 from gsdmsr_cli.raster import Engine
 from gsdmsr_cli.run import Checkpoint
 from gsdmsr_cli.scene import Scene, View
@@ -46,9 +45,9 @@ _LAST = "last."
 
 @dataclass(frozen=True)
 class Step:
-    """What one step did: the loss, or NaN if the step was skipped."""
+    """What one step did: the loss, (), which is not finite if the step was skipped."""
 
-    loss: float
+    loss: Tensor
 
 
 class Trainer:
@@ -62,21 +61,28 @@ class Trainer:
         stopwatch: what the time goes into.
     """
 
-    def __init__(self, scene: Scene, preset: Preset, engine: Engine, pictures: Pictures) -> None:
-        self.scene, self.preset = scene, preset
+    def __init__(
+        self,
+        scene: Scene,
+        preset: Preset,
+        engine: Engine,
+        pictures: Pictures,
+        device: torch.device | str = "cpu",
+    ) -> None:
+        self.scene, self.preset, self.device = scene, preset, torch.device(device)
         self.views = scene.split("train")
-        self.observer = Observer(preset, engine, pictures)
+        self.observer = Observer(preset, engine, pictures, device)
         self.team = Team(self.observer, self.views)
         self.radius = scene.radius
         self.generator = torch.Generator().manual_seed(preset.training.seed)
-        background = self.observer.background
+        background = torch.tensor(BACKGROUNDS[preset.data.background])
         splats = initial_splats(scene, preset.splats, pictures, background, self.generator)
         self.facts = facts_of(scene, splats)
         motion = start_motion(preset.motion, self.facts, len(splats), self.generator)
-        self.model = Model(splats, motion)
+        self.model = Model(splats, motion).to(device)
         self.optimizer = Adam()
-        self.saliency = Saliency(len(self.model.splats), preset.saliency)
-        self.statistics = DensityStatistics(len(self.model.splats))
+        self.saliency = Saliency(len(self.model.splats), preset.saliency, device)
+        self.statistics = DensityStatistics(len(self.model.splats), device)
         self.tiles = TileSampler(preset.training.tiles_per_view)
         self.average = averaging.Average()
         self.clock = new_clock(preset.training)
@@ -113,26 +119,26 @@ class Trainer:
                 self.model, rows, stage, tile_weights,
                 lambda: self._penalise(tensors, self.views[rows[0]]) if penalised else None,
             )  # fmt: skip
-        value = fmean(look.loss for look in looks)
+        value = torch.stack([look.loss for look in looks]).mean()
         gradients = [look.gradients for look in looks]
         if penalty is not None:
-            value += PENALTY_EVERY * penalty[0]
+            value = value + PENALTY_EVERY * penalty[0]
             weight = PENALTY_EVERY * len(looks)
             gradients.append([None if part is None else part * weight for part in penalty[1]])
         for tensor, *parts in zip(tensors.values(), *gradients, strict=True):
             tensor.grad = _sum(parts)
         self.clock.step += 1
-        if not math.isfinite(value):
-            return self._skip()
-        self._skipped = 0
+        # a GPU is not waited for: there the optimiser looks at the loss, and `count` is told later
+        if value.is_cpu and not self.count([value.item()]):
+            return self._skip(value)
         for row, weights, look in zip(rows, tile_weights, looks, strict=True):
             if weights is not None and look.errors is not None:
-                self.tiles.learn(row, weights, look.errors)
+                self.tiles.learn(row, weights, look.errors.cpu())
         if progress < self.preset.density.until:
             for look in looks:
                 self.statistics.observe(look.on_screen, *look.size)
         with self.stopwatch.of("learn"):
-            self._learn(tensors, progress, looks if gated else None)
+            self._learn(tensors, progress, value, looks if gated else None)
         with self.stopwatch.of("grow"):
             self._control_density(progress)
             self._settle(progress)
@@ -158,17 +164,18 @@ class Trainer:
         if not self.average.count:
             return self.model
         tensors = self.average.tensors | {MOVING: torch.tensor(self.model.moving)}
-        return load_model(tensors, self.preset.motion, self.facts, self.clock.progress)
+        model = load_model(tensors, self.preset.motion, self.facts, self.clock.progress)
+        return model.to(self.device)
 
     def _penalise(
         self, tensors: Mapping[str, Tensor], view: View
-    ) -> tuple[float, Sequence[Tensor | None]]:
+    ) -> tuple[Tensor | float, Sequence[Tensor | None]]:
         """Return the penalty and its gradients."""
         penalty = self.model.penalty(view.time, self.generator)
         if penalty is None:
             return 0.0, [None] * len(tensors)
         gradients = torch.autograd.grad(penalty, list(tensors.values()), allow_unused=True)
-        return penalty.item(), gradients
+        return penalty.detach(), gradients
 
     def _next_row(self) -> int:
         """Return the next view of a random order that visits every view before any again."""
@@ -199,7 +206,11 @@ class Trainer:
         return rates | {MOVED_BY + name: groups[group] for name, group in moving.items()}
 
     def _learn(
-        self, tensors: Mapping[str, Tensor], progress: float, watched: Sequence[Look] | None
+        self,
+        tensors: Mapping[str, Tensor],
+        progress: float,
+        loss: Tensor,
+        watched: Sequence[Look] | None,
     ) -> None:
         """Let Adam step; where the splats are gated, their saliency follows what was looked at."""
         gates = {} if watched is None else self._gates(tensors)
@@ -207,7 +218,7 @@ class Trainer:
         rest = self.model.splats.sh.detach()[:, 1:]
         before = None if share == 1 else rest.clone()
         with self.team.all_threads():
-            self.optimizer.step(tensors, self._rates(progress), gates)
+            self.optimizer.step(tensors, self._rates(progress), gates, loss)
         if before is not None:
             rest.copy_(torch.lerp(before, rest, share))
         if watched is not None:
@@ -231,9 +242,11 @@ class Trainer:
         now = step_saliency(self.model.splats, steps, raw)
         seen = torch.stack([look.on_screen for look in looks]).any(dim=2).any(dim=0)
         woken = self.saliency.observe(now, seen)
-        if woken.any():  # what they were about to do when they fell asleep is of no use any more
-            self.optimizer.calm(STORED, woken)
-            self.optimizer.calm(self.model.held_by_motion(), woken[: self.model.moving])
+        if woken.is_cpu and not woken.any():
+            return
+        # what they were about to do when they fell asleep is of no use any more
+        self.optimizer.calm(STORED, woken)
+        self.optimizer.calm(self.model.held_by_motion(), woken[: self.model.moving])
 
     def _control_density(self, progress: float) -> None:
         options = self.preset.density
@@ -259,7 +272,7 @@ class Trainer:
             reset_opacities(self.model.splats)
             self.optimizer.forget(STORED_AS + "logit_opacities")
             self.average.forget()
-            self.saliency.pardon(torch.ones(len(self.model.splats), dtype=torch.bool))
+            self.saliency.pardon(torch.ones_like(self.saliency.high))
 
     def _density_is_due(self, progress: float) -> bool:
         """Tell whether to grow and prune, or only to prune, after this step."""
@@ -280,7 +293,7 @@ class Trainer:
         self.optimizer.take(self.model.held_by_motion(), rows[held], fresh[held])
         self.average.take(STORED, rows)
         self.average.take(self.model.held_by_motion(), rows[held])
-        self.statistics = DensityStatistics(len(rows))
+        self.statistics = DensityStatistics(len(rows), self.device)
         self.saliency.take(rows, fresh)
 
     def _settle(self, progress: float) -> None:
@@ -292,19 +305,28 @@ class Trainer:
         if self.clock.step % options.still_every == 0:
             saliency, mean = motion_saliency(self.model)
             order = self.model.settle(saliency < options.still_below, mean)
-            self._follow(order, torch.zeros(len(order), dtype=torch.bool))
+            self._follow(order, torch.zeros_like(order, dtype=torch.bool))
 
-    def _skip(self) -> Step:
-        """Drop a step whose loss is not finite; give up after many in a row."""
-        self._skipped += 1
+    def count(self, losses: Sequence[float]) -> bool:
+        """Take note of the losses of steps, and return whether the last is finite.
+
+        Raises:
+            GsdmsrError: too many in a row are not.
+        """
+        for loss in losses:
+            self._skipped = 0 if math.isfinite(loss) else self._skipped + 1
+            if self._skipped >= PATIENCE:
+                raise GsdmsrError(
+                    f"the loss is not finite for {PATIENCE} steps up to step {self.clock.step}; "
+                    "the last checkpoint is kept; lower the learning rates with --set optimizer..."
+                )
+        return not self._skipped
+
+    def _skip(self, loss: Tensor) -> Step:
+        """Drop a step whose loss is not finite."""
         for tensor in self.model.tensors().values():
             tensor.grad = None
-        if self._skipped >= PATIENCE:
-            raise GsdmsrError(
-                f"the loss is not finite for {PATIENCE} steps up to step {self.clock.step}; "
-                "the last checkpoint is kept; lower the learning rates with --set optimizer..."
-            )
-        return Step(math.nan)
+        return Step(loss)
 
     def _parts(self) -> dict[str, Part]:
         """Return what is kept beside the model, by the prefix of its tensors in a checkpoint."""
@@ -338,7 +360,8 @@ class Trainer:
 
     def restore(self, checkpoint: Checkpoint) -> None:
         """Go on from a checkpoint of the same preset and scene."""
-        tensors, state = checkpoint.tensors, checkpoint.state
+        state = checkpoint.state
+        tensors = {name: tensor.to(self._home(name)) for name, tensor in checkpoint.tensors.items()}
         self.average = averaging.Average()
         self.average.count = int(state["averaged"])
         last = dict(tensors)
@@ -347,7 +370,8 @@ class Trainer:
             self.average.tensors = {name: tensors[name] for name in last}
             if MOVING in tensors:
                 last[MOVING] = tensors[MOVING]
-        self.model = load_model(last, self.preset.motion, self.facts, checkpoint.progress)
+        model = load_model(last, self.preset.motion, self.facts, checkpoint.progress)
+        self.model = model.to(self.device)
         self.statistics = DensityStatistics(len(self.model.splats))
         scatter(self._parts(), tensors)
         self.optimizer.steps = {name: int(count) for name, count in state["adam_steps"].items()}
@@ -356,6 +380,10 @@ class Trainer:
         self._rounds, self._resets = int(state["rounds"]), int(state["resets"])
         self._moving = bool(state["moving"])
         self.clock.step, self.clock.before = checkpoint.step, checkpoint.elapsed
+
+    def _home(self, name: str) -> torch.device:
+        """Return where a checkpoint's tensor belongs: chance and tiles are matters of the CPU."""
+        return torch.device("cpu") if name.startswith(("generator", "tiles.")) else self.device
 
 
 def _sum(parts: Sequence[Tensor | None]) -> Tensor | None:

@@ -34,7 +34,9 @@ class _GreyPictures(Pictures):
         return torch.full((3, view.camera.height, view.camera.width), 128, dtype=torch.uint8)
 
 
-def warm_up(scene: Scene, preset: Preset, engine: Engine) -> float:
+def warm_up(
+    scene: Scene, preset: Preset, engine: Engine, device: torch.device | str = "cpu"
+) -> float:
     """Train a handful of splats on small grey pictures; return how long it took [s].
 
     The steps sweep the preset's own phases and grow splats all the way. Torch's global random
@@ -42,7 +44,7 @@ def warm_up(scene: Scene, preset: Preset, engine: Engine) -> float:
     """
     started = time.perf_counter()
     with torch.random.fork_rng(devices=[]):
-        trainer = Trainer(_small(scene), _short(preset), engine, _GreyPictures())
+        trainer = Trainer(_small(scene), _short(preset), engine, _GreyPictures(), device)
         for _ in range(STEPS):
             trainer.step()
     return time.perf_counter() - started

@@ -80,3 +80,16 @@ def test_strided_tensors_are_refused() -> None:
     strided = torch.zeros(2, 3).T
     with pytest.raises(ValueError, match="not contiguous"):
         adam([Row(strided, strided, strided, strided, 0.1, 1.0)], BETA1, BETA2, EPS)
+
+
+@pytest.mark.parametrize("loss", [float("nan"), float("inf"), -float("inf")])
+def test_a_loss_that_is_not_finite_moves_nothing(loss: float) -> None:
+    of = move((40, 3), 5, True)
+    assert of.gate is not None
+    tensors = of.tensor, of.first, of.second, of.gate.trace
+    before = [t.clone() for t in tensors]
+    adam([row(of)], BETA1, BETA2, EPS, torch.tensor(loss))
+    for now, was in zip(tensors, before, strict=True):
+        assert torch.equal(now, was)
+    adam([row(of)], BETA1, BETA2, EPS, torch.tensor(0.5))
+    assert not torch.equal(of.tensor, before[0])

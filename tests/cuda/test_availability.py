@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 
 from gsdmsr_cli import raster
-from gsdmsr_cli.cuda import availability
-from gsdmsr_cli.errors import DataError
+from gsdmsr_cli.cuda import availability, launch, room
+from gsdmsr_cli.errors import DataError, GsdmsrError
+from gsdmsr_cli.raster import _check, cpu, cuda
 
 
 @pytest.fixture
@@ -17,11 +20,13 @@ def machine(monkeypatch: pytest.MonkeyPatch) -> pytest.MonkeyPatch:
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "get_device_capability", lambda: (9, 0))
     monkeypatch.setattr(availability, "load_nvrtc", lambda _: object())
+    monkeypatch.setattr(cuda, "_disagreement", lambda: None)
     return monkeypatch
 
 
 def test_nothing_is_missing_where_all_is_there(machine: pytest.MonkeyPatch) -> None:
     assert availability.missing() is None
+    assert raster.pick_device("auto") == raster.pick_device("cuda") == "cuda"
     assert raster.best_engine("cuda") is raster.load_engine("cuda")
 
 
@@ -47,9 +52,56 @@ def test_no_compiler(machine: pytest.MonkeyPatch) -> None:
 
 def test_a_wish_for_cuda_is_refused_in_one_line(machine: pytest.MonkeyPatch) -> None:
     machine.setattr(torch.cuda, "is_available", lambda: False)
+    assert raster.pick_device("auto") == "cpu"
     with pytest.raises(DataError, match=r"^--device cuda: torch finds no .*; use --device cpu$"):
         raster.pick_device("cuda")
 
 
 def test_the_engine_does_not_draw_in_the_memory_of_the_cpu() -> None:
     assert "memory of a GPU" in str(raster.load_engine("cuda").unavailable("cpu"))
+
+
+def test_a_gpu_that_draws_otherwise_is_not_relied_on(machine: pytest.MonkeyPatch) -> None:
+    machine.setattr(cuda, "_disagreement", lambda: "the picture of a test drawing is wrong")
+    assert raster.pick_device("auto") == "cpu"
+    with pytest.raises(DataError, match="the picture of a test drawing is wrong; use --device cpu"):
+        raster.pick_device("cuda")
+
+
+def test_a_healthy_engine_agrees_with_the_reference() -> None:
+    assert _check.disagreement(cpu.rasterize, "cpu") is None
+
+
+@pytest.mark.usefixtures("kernels_on_the_cpu")
+def test_the_kernels_agree_with_the_reference() -> None:
+    assert _check.disagreement(cuda.rasterize, "cpu") is None
+
+
+def test_kernels_that_do_nothing_are_found_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Nobody:
+        def launch(self, *_: object) -> None:
+            pass
+
+    monkeypatch.setitem(launch.runners, "cpu", Nobody())
+    monkeypatch.setattr(room.Room, "find", lambda *_: 1)
+    # memory that nobody has written to may hold anything
+    monkeypatch.setattr(torch.Tensor, "new_empty", torch.Tensor.new_zeros)
+    assert _check.disagreement(cuda.rasterize, "cpu") == "the picture of a test drawing is wrong"
+
+
+def test_wrong_gradients_are_found_out() -> None:
+    wrong = _check.disagreement(
+        lambda splats, *given: cpu.rasterize(
+            replace(splats, quats=2 * splats.quats - splats.quats.detach()), *given
+        ),
+        "cpu",
+    )
+    assert wrong == "the gradient of quats of a test drawing is wrong"
+
+
+def test_a_driver_that_fails_is_told_of() -> None:
+    def draw(*_: object) -> None:
+        raise GsdmsrError("the NVIDIA driver failed when launching project: no image (209)")
+
+    said = _check.disagreement(draw, "cpu")
+    assert said is not None and said.startswith("it fails a test drawing: the NVIDIA driver failed")

@@ -89,7 +89,7 @@ def test_every_report_is_told_and_logged(trainer: Trainer, run: Run) -> None:
 
     def remember() -> Step:
         made = step()
-        losses.append(made.loss)
+        losses.append(made.loss.item())
         return made
 
     trainer.step = remember  # type: ignore[method-assign]
@@ -112,7 +112,7 @@ def test_a_report_sums_up_the_steps_since_the_last(
 
     def step() -> Step:
         trainer.clock.step += 1
-        return Step(next(losses))
+        return Step(torch.tensor(next(losses)))
 
     trainer.step = step  # type: ignore[method-assign]
     trainer.clock.steps = 26
@@ -125,7 +125,7 @@ def test_a_report_sums_up_the_steps_since_the_last(
 def test_without_a_finite_loss_the_report_has_none(trainer: Trainer, run: Run) -> None:
     def step() -> Step:
         trainer.clock.step += 1
-        return Step(math.nan)
+        return Step(torch.tensor(math.nan))
 
     trainer.step = step  # type: ignore[method-assign]
     train(trainer, run, lambda report: None)
@@ -159,7 +159,7 @@ def test_a_model_that_is_not_a_number_has_no_psnr(trainer: Trainer, run: Run) ->
     def step() -> Step:
         trainer.clock.step += 1
         trainer.observer.background = torch.full((3,), math.nan)
-        return Step(1.0)
+        return Step(torch.tensor(1.0))
 
     trainer.step = step  # type: ignore[method-assign]
     train(trainer, run, lambda report: None)

@@ -11,6 +11,7 @@
 #include <cstdio>
 #include <cstdlib>
 #include <cstring>
+#include <deque>
 #include <ucontext.h>
 #include <utility>
 #include <vector>
@@ -64,7 +65,7 @@ struct Fiber {
     bool begun = false, ended = false;
 };
 
-inline std::vector<Fiber> fibers;
+inline std::deque<Fiber> fibers;  // which never moves what it holds
 inline std::vector<Warp> warps;
 inline Barrier whole;
 inline int votes[2][2];  // by parity of the barrier: how many came, how many said yes
@@ -95,13 +96,16 @@ inline void leave(Barrier &barrier) {
     if (barrier.members > 0 && barrier.waiting == barrier.members) open(barrier);
 }
 
+// What a fiber does for all its life: the same thread of one block after another.
 inline void run_fiber() {
-    work(work_arguments);
-    fibers[current].ended = true;
-    progress++;
-    leave(warps[current / WARP_SIZE].barrier);
-    leave(whole);
-    _longjmp(scheduler, 1);
+    for (;;) {
+        work(work_arguments);
+        fibers[current].ended = true;
+        progress++;
+        leave(warps[current / WARP_SIZE].barrier);
+        leave(whole);
+        yield();
+    }
 }
 
 inline void resume(int index) {
@@ -135,13 +139,13 @@ inline bool run_warp(int first, int last) {
 
 inline void run_block() {
     int threads = block_size.x;
-    fibers.resize(threads);
+    if ((int)fibers.size() < threads) fibers.resize(threads);
     warps.assign((threads + WARP_SIZE - 1) / WARP_SIZE, Warp());
     whole = Barrier();
     whole.members = threads;
     memset(votes, 0, sizeof votes);
     for (int i = 0; i < threads; i++) {
-        fibers[i].begun = fibers[i].ended = false;
+        fibers[i].ended = false;
         warps[i / WARP_SIZE].barrier.members++;
     }
     for (bool left = true; left;) {
