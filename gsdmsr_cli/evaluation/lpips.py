@@ -163,7 +163,8 @@ def _find(net: str, kind: str, names: tuple[str, ...], folders: list[Path]) -> P
     for path in (folder / name for folder in folders for name in names):
         if path.is_file():
             return path
-    reason = f"no {kind} weights of LPIPS '{net}': found none of {', '.join(names)}"
+    looked_for = f"found none of {', '.join(names)}"
+    reason = f"no {kind} weights of LPIPS '{net}': {looked_for}; see gsdmsr weights --fetch {net}"
     return Missing(reason, tuple(map(str, folders)))
 
 
