@@ -408,12 +408,13 @@ def kernels(
     yardstick: Annotated[
         Path | None, typer.Option(metavar="DIR", help="Folder of other kernels to compare with.")
     ] = None,
+    device: Annotated[Literal["cpu", "cuda"], typer.Option(help="What to time.")] = "cpu",
     as_json: Json = False,
 ) -> None:
     """Time drawing and a training step, forward and backward."""
     from gsdmsr_cli.commands import benchmark_kernels as command
 
-    command.run(yardstick, as_json)
+    command.run(yardstick, device, as_json)
 
 
 @benchmark_app.command()

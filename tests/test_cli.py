@@ -172,7 +172,8 @@ def test_version(gsdmsr: Gsdmsr, capsys: pytest.CaptureFixture[str]) -> None:
             "weights",
             (["vgg", "alex"], Path("o"), Path("w"), True),
         ),
-        ("benchmark kernels --yardstick y --json", "benchmark_kernels", (Path("y"), True)),
+        ("benchmark kernels --yardstick y --json", "benchmark_kernels", (Path("y"), "cpu", True)),
+        ("benchmark kernels --device cuda", "benchmark_kernels", (None, "cuda", False)),
         (
             "benchmark scenes a --out o --steps 9",
             "benchmark_scenes",

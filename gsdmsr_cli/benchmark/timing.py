@@ -10,7 +10,9 @@ ROUNDS = 9
 SECONDS_A_TURN = 0.25
 
 
-def in_turns(functions: Mapping[str, Callable[[], None]], rounds: int = ROUNDS) -> dict[str, float]:
+def in_turns(
+    functions: Mapping[str, Callable[[], object]], rounds: int = ROUNDS
+) -> dict[str, float]:
     """Return each function's milliseconds per call: the median over rounds of a turn's median.
 
     Every function runs twice first, which compiles it. In each round every function has a turn of
@@ -29,7 +31,7 @@ def in_turns(functions: Mapping[str, Callable[[], None]], rounds: int = ROUNDS) 
     return {name: 1e3 * statistics.median(times) for name, times in turns.items()}
 
 
-def _median_call(function: Callable[[], None], calls: int) -> float:
+def _median_call(function: Callable[[], object], calls: int) -> float:
     times = []
     for _ in range(calls):
         started = time.perf_counter()

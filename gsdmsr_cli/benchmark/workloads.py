@@ -29,28 +29,43 @@ def target_of(rgb: Tensor) -> Tensor:
     return (picture * 255).to(torch.uint8).permute(2, 0, 1).contiguous()
 
 
-def drawing(size: int, count: int) -> Callable[[], None]:
-    """Return a function that draws degree-0 splats and takes the gradients of all stored values."""
-    splats = cloud(count).map(lambda t: t.requires_grad_(True))
-    engine, view, background = best_engine("cpu"), camera(size), torch.ones(3)
-    slope = torch.randn(3, size, size, generator=torch.Generator().manual_seed(0))
+def drawing(size: int, count: int, device: str = "cpu") -> Callable[[], None]:
+    """Return a function that draws degree-0 splats and takes the gradients of all stored values.
+
+    It waits for the device, "cpu" or "cuda", and so does that of ``training_step``.
+    """
+    splats = cloud(count).map(lambda t: t.to(device).requires_grad_(True))
+    engine, view, background = best_engine(device), camera(size), torch.ones(3, device=device)
+    slope = slope_of(size, device)
 
     def run() -> None:
         frame = engine.rasterize(splats, view, background)
         frame.rgb.backward(slope.permute(1, 2, 0))  # type: ignore[no-untyped-call]
         for tensor in splats.tensors().values():
             tensor.grad = None
+        wait(device)
 
     return run
 
 
-def training_step(size: int, count: int, motion: str) -> Callable[[], None]:
+def slope_of(size: int, device: str) -> Tensor:
+    """Return the gradient (3, size, size) that drawings are differentiated with."""
+    return torch.randn(3, size, size, generator=_generator()).to(device)
+
+
+def wait(device: str) -> None:
+    """Return when the device has done what it was given."""
+    if device != "cpu":
+        torch.cuda.synchronize()
+
+
+def training_step(size: int, count: int, motion: str, device: str = "cpu") -> Callable[[], None]:
     """Return a function that makes a training step at rate 0: L1 + SSIM, one view."""
     moving = start_motion({"name": motion}, Facts(1.0, CUBE, FRAMES), count, _generator())
-    model = Model(cloud(count), moving)
+    model = Model(cloud(count), moving).to(device)
     model.motion.advance(1.0)
-    engine, view, background = best_engine("cpu"), camera(size), torch.ones(3)
-    target = target_of(draw(model, view, TIME, engine, background).rgb)
+    engine, view, background = best_engine(device), camera(size), torch.ones(3, device=device)
+    target = target_of(draw(model, view, TIME, engine, background).rgb.cpu()).to(device)
     optimizer, rates = Adam(), dict.fromkeys(model.tensors(), 0.0)
 
     def run() -> None:
@@ -58,6 +73,7 @@ def training_step(size: int, count: int, motion: str) -> Callable[[], None]:
         for tensor, gradient in zip(model.tensors().values(), look.gradients, strict=True):
             tensor.grad = gradient
         optimizer.step(model.tensors(), rates)
+        wait(device)
 
     return run
 

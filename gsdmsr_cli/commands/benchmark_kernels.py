@@ -4,54 +4,90 @@ from __future__ import annotations
 
 import json
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
 from rich.table import Table
 
-from gsdmsr_cli.benchmark import workloads, yardstick
+from gsdmsr_cli import raster
+from gsdmsr_cli.benchmark import gsplat, workloads, yardstick
 from gsdmsr_cli.benchmark.timing import in_turns
+from gsdmsr_cli.cuda import availability
+from gsdmsr_cli.errors import UsageError
 from gsdmsr_cli.kernels.jit import threads
 
-CASES = ((400, 20_000), (800, 50_000))
+CASES = {
+    "cpu": ((400, 20_000), (800, 50_000)),
+    "cuda": ((800, 50_000), (800, 200_000), (800, 1_000_000)),
+}
+"""Sides of pictures and numbers of splats, by device."""
+
 MOTIONS = ("hexplane", "multiscale")
 
 
-def run(yardstick_folder: Path | None, as_json: bool) -> None:
-    """Time every case, in turns with the yardstick if a folder is given, and print a table."""
-    other = None if yardstick_folder is None else yardstick.load_yardstick(yardstick_folder)
-    console = Console(stderr=True)
+def run(yardstick_folder: Path | None, device: str, as_json: bool) -> None:
+    """Time every case, in turns with a yardstick if there is one, and print a table.
+
+    On the CPU that is a folder of other kernels, on a GPU gsplat where it is installed.
+
+    Raises:
+        UsageError: a folder is given for a GPU.
+        DataError: the device is not there, or the folder holds no yardstick.
+    """
+    where, console = raster.pick_device(device), Console(stderr=True)
+    other = _yardstick(yardstick_folder, where, console)
     rows = []
-    for size, count in CASES:
+    for size, count in CASES[where]:
         with console.status(f"{size} x {size}, {count} splats"):
-            rows += _measure(size, count, other)
+            rows += _measure(size, count, where, other)
+    usage = availability.usage(where)
     if as_json:
-        sys.stdout.write(json.dumps({"schema": 1, "threads": threads(), "rows": rows}) + "\n")
+        document = {"schema": 1, "threads": threads(), "device": where, **usage, "rows": rows}
+        sys.stdout.write(json.dumps(document) + "\n")
     else:
-        Console().print(_table(rows))
+        Console().print(_table(rows, usage["gpu"] or f"{threads()} threads"))
 
 
-def _measure(size: int, count: int, other: Any) -> list[dict[str, Any]]:
-    functions = {"draw forward + backward": workloads.drawing(size, count)}
+def _yardstick(folder: Path | None, device: str, console: Console) -> Any:
+    """Return what is timed beside us, or None."""
+    if device == "cpu":
+        return None if folder is None else yardstick.load_yardstick(folder)
+    if folder is not None:
+        raise UsageError("--yardstick is for the CPU; on a GPU the yardstick is gsplat")
+    found = gsplat.load_gsplat()
+    if isinstance(found, str):
+        console.print(f"without a yardstick: {found}", markup=False, highlight=False)
+        return None
+    return found
+
+
+def _measure(size: int, count: int, device: str, other: Any) -> list[dict[str, Any]]:
+    functions: dict[str, Callable[[], object]] = {
+        "draw forward + backward": workloads.drawing(size, count, device)
+    }
     for motion in MOTIONS:
-        functions[f"training step, {motion}"] = workloads.training_step(size, count, motion)
-    if other is not None:
+        step = workloads.training_step(size, count, motion, device)
+        functions[f"training step, {motion}"] = step
+    if other is not None and device == "cpu":
         functions["yardstick draw"] = yardstick.drawing(other, size, count)
         functions["yardstick step"] = yardstick.training_step(other, size, count)
+    elif other is not None:
+        functions["yardstick draw"] = gsplat.drawing(other, size, count, device)
     times = in_turns(functions)
     rows = []
     for name in list(functions)[: 1 + len(MOTIONS)]:
         row = {"size": size, "splats": count, "what": name, "ms": times[name]}
-        if other is not None:
-            against = "yardstick draw" if name.startswith("draw") else "yardstick step"
+        against = "yardstick draw" if name.startswith("draw") else "yardstick step"
+        if against in times:
             row |= {"yardstick_ms": times[against], "ratio": times[name] / times[against]}
         rows.append(row)
     return rows
 
 
-def _table(rows: list[dict[str, Any]]) -> Table:
-    table = Table(title=f"Milliseconds, medians, {threads()} threads")
+def _table(rows: list[dict[str, Any]], on: str) -> Table:
+    table = Table(title=f"Milliseconds, medians, {on}")
     table.add_column("picture")
     table.add_column("splats", justify="right")
     table.add_column("what")

@@ -15,6 +15,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from gsdmsr_cli import __version__, plugins, preset_files, raster
+from gsdmsr_cli.cuda import availability
 from gsdmsr_cli.errors import GsdmsrError
 from gsdmsr_cli.evaluation.lpips import NETS, load_lpips
 from gsdmsr_cli.evaluation.metrics import Missing
@@ -52,6 +53,7 @@ def examine() -> dict[str, Any]:
         "python": platform.python_version(),
         "platform": f"{platform.system()} {platform.release()} {platform.machine()}",
         "cpu": {"name": llvm.get_host_cpu_name(), "cores": _cores(), "simd": _simd()},
+        "gpu": availability.describe(),
         "packages": {name: _version(name) for name in _PACKAGES},
         "engines": {name: _engine(name) for name in raster.engine_names()},
         "lpips": {net: _lpips(net) for net in NETS},
@@ -107,6 +109,7 @@ def _table(report: dict[str, Any]) -> Table:
     table.add_row(
         "cpu", f"{cpu['name']}, {cpu['cores']} cores, {' '.join(cpu['simd']) or 'no SIMD'}"
     )
+    table.add_row("gpu", _gpu(report["gpu"]))
     for name, version in report["packages"].items():
         table.add_row(name, version or "[red]missing[/]; pip install gsdmsr brings it")
     for name, devices in report["engines"].items():
@@ -119,6 +122,15 @@ def _table(report: dict[str, Any]) -> Table:
     table.add_row("presets", ", ".join(report["presets"]))
     table.add_row("ffmpeg", report["ffmpeg"] or "not on the path; OpenCV's own is used")
     return table
+
+
+def _gpu(found: dict[str, Any]) -> str:
+    if found["missing"] is not None:
+        return f"[yellow]no[/]: {escape(found['missing'])}"
+    return escape(
+        f"{found['name']}, {found['memory_mib']} MiB, compute capability {found['capability']}; "
+        f"torch for CUDA {found['cuda']}, NVRTC {found['nvrtc']}"
+    )
 
 
 def _verdict(reason: str | None) -> str:

@@ -15,6 +15,7 @@ from rich.console import Console
 from gsdmsr_cli import machine, raster, strict
 from gsdmsr_cli.commands._progress import progress_bar
 from gsdmsr_cli.commands._training_display import TrainingDisplay
+from gsdmsr_cli.cuda import availability
 from gsdmsr_cli.errors import UsageError
 from gsdmsr_cli.files import write_json
 from gsdmsr_cli.formats import read_scene
@@ -183,6 +184,7 @@ def _write_account(
         "peak_rss_mib": machine.peak_rss_mib(processes - 1),
         "device": device,
         "processor": machine.cpu_name(),
+        **availability.usage(device),
         "threads": threads(),
         "processes": processes,
         "versions": machine.versions(),

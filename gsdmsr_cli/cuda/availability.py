@@ -1,6 +1,8 @@
-"""Whether kernels can be compiled and run here, and if not, why."""
+"""Whether kernels can be compiled and run here, and if not, why; and on what."""
 
 from __future__ import annotations
+
+from typing import Any
 
 import torch
 
@@ -28,3 +30,27 @@ def missing() -> str | None:
     if load_nvrtc(major) is None:
         return f"NVRTC of CUDA {major} is missing; pip install 'gsdmsr[cuda]' brings it"
     return None
+
+
+def describe() -> dict[str, Any]:
+    """Return what there is, fit for JSON, with null for what is not there.
+
+    "cuda" is the version that torch is built for, "nvrtc" that of the compiler, "name",
+    "memory_mib" and "capability" are the GPU's, and "missing" is ``missing()``.
+    """
+    found: dict[str, Any] = dict.fromkeys(("name", "memory_mib", "capability"))
+    if torch.cuda.is_available():
+        card = torch.cuda.get_device_properties(torch.cuda.current_device())
+        found["name"], found["memory_mib"] = card.name, card.total_memory >> 20
+        found["capability"] = f"{card.major}.{card.minor}"
+    nvrtc = load_nvrtc(built_for())
+    version = None if nvrtc is None else f"{nvrtc.version[0]}.{nvrtc.version[1]}"
+    return {"cuda": torch.version.cuda, "nvrtc": version, **found, "missing": missing()}
+
+
+def usage(device: str) -> dict[str, Any]:
+    """Return the GPU's name and the most memory its tensors have taken [MiB], None on the CPU."""
+    if device == "cpu":
+        return {"gpu": None, "peak_gpu_mib": None}
+    peak = torch.cuda.max_memory_allocated() / (1 << 20)
+    return {"gpu": torch.cuda.get_device_name(), "peak_gpu_mib": round(peak, 1)}

@@ -77,11 +77,11 @@ class Saliency:
         self.age = (self.age + 1).masked_fill(changes, 0)
         return changes & self.high
 
-    def _threshold(self) -> float:
+    def _threshold(self) -> Tensor | float:
         quantile, count = self.options.quantile, len(self.scores)
         if quantile == 0 or count == 0:
             return self.options.threshold
-        return float(self.scores.kthvalue(max(1, round(quantile * count))).values)
+        return self.scores.kthvalue(max(1, round(quantile * count))).values
 
     def take(self, rows: Tensor, fresh: Tensor) -> None:
         """Follow a resize; rows that are ``fresh`` (M,) begin high, in grace."""

@@ -5,12 +5,14 @@ from __future__ import annotations
 import json
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
 
 from gsdmsr_cli import raster
 from gsdmsr_cli.commands import doctor
+from gsdmsr_cli.cuda import availability
 
 
 @pytest.fixture(autouse=True)
@@ -86,3 +88,27 @@ def test_the_table_shows_reasons_as_they_are_written(
     out = capsys.readouterr().out
     assert "engine reference on cuda" in out
     assert "no: not [bold] here" in out
+
+
+def test_the_gpu_is_described_or_what_is_missing(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    found = doctor.examine()["gpu"]
+    assert found["missing"] == availability.missing()
+    assert (found["name"] is None) == (not torch.cuda.is_available())
+    card = SimpleNamespace(name="Some [Card]", total_memory=80 << 30, major=9, minor=0)
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "current_device", lambda: 0)
+    monkeypatch.setattr(torch.cuda, "get_device_properties", lambda _: card)
+    monkeypatch.setattr(torch.version, "cuda", "13.0")
+    monkeypatch.setattr(availability, "missing", lambda: None)
+    monkeypatch.setattr(availability, "load_nvrtc", lambda _: SimpleNamespace(version=(13, 0)))
+    monkeypatch.setattr(doctor, "_engine", lambda _: {"cpu": None, "cuda": None})
+    monkeypatch.setenv("COLUMNS", "200")
+    assert doctor.examine()["gpu"] == {
+        "cuda": "13.0", "nvrtc": "13.0", "name": "Some [Card]", "memory_mib": 81920,
+        "capability": "9.0", "missing": None,
+    }  # fmt: skip
+    doctor.run(as_json=False)
+    said = "Some [Card], 81920 MiB, compute capability 9.0; torch for CUDA 13.0, NVRTC 13.0"
+    assert said in capsys.readouterr().out

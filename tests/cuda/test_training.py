@@ -100,7 +100,7 @@ def elsewhere(data: Path, preset: Preset) -> Trainer:
         ((), "space_penalty"),
         (("losses.ssim=0",), "blend_l1"),
         (("saliency.gate=scale", "saliency.gate_from=0"), "adam"),
-        (("saliency.gate=freeze", "saliency.gate_from=0"), "adam"),
+        (("saliency.gate=freeze", "saliency.gate_from=0", "saliency.quantile=0.5"), "adam"),
         (("motion.smooth_weight=0.1",), "lookup_backward"),
     ],
 )
