@@ -16,6 +16,9 @@ from gsdmsr_cli.errors import DataError, GsdmsrError
 REFUSED = 3
 """Exit code of a child that has told, on its last line, why the data cannot be used."""
 
+DISK = ("disk", "no space", "file too large", "filesystem error", "i/o error")
+"""Words by which SQLite and COLMAP tell that a file could not be written."""
+
 ONE_THREAD = {"OMP_NUM_THREADS": "1"}
 """COLMAP has threads of its own where they do no harm; OpenMP's come and go with the load."""
 
@@ -63,9 +66,19 @@ def run_child(job: str, arguments: Mapping[str, Any], tell: Callable[[int, int],
             raise DataError(last)
         if code:
             said.seek(0)
-            words = [word.strip() for word in said.read().split("\n") if word.strip()]
-            reason = words[-1] if words else f"exit code {code}"
-            raise GsdmsrError(f"COLMAP has failed in its job {job}: {reason}")
+            raise _failure(job, [line.strip() for line in said if line.strip()], code)
+
+
+def _failure(job: str, lines: list[str], code: int) -> GsdmsrError:
+    """Return the error of a job that has failed, from what it has printed."""
+    for line in lines:  # COLMAP may go on to print where in its code that was
+        if any(word in line.lower() for word in DISK):
+            return DataError(
+                f"COLMAP cannot write its files ({line}); free space or choose another --out; what "
+                "is finished is kept"
+            )
+    reason = lines[-1] if lines else f"exit code {code}"
+    return GsdmsrError(f"COLMAP has failed in its job {job}: {reason}")
 
 
 def end_with_parent() -> None:

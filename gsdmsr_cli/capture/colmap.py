@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from gsdmsr_cli.capture.child import REFUSED, end_with_parent
+from gsdmsr_cli.capture.failure import why_no_model
 from gsdmsr_cli.capture.features import read_features
 from gsdmsr_cli.capture.masks import read_mask, standing
 from gsdmsr_cli.errors import DataError
@@ -120,7 +121,7 @@ def map_frames(matches: str, pictures: str, out: str, mapping: str, seed: int, c
     else:
         found = _map_incrementally(colmap, database, pictures, models, seed, count)
     if not found:
-        raise DataError("no model")
+        raise DataError(why_no_model(colmap, database))
     ranked = sorted(found.values(), key=lambda m: (-m.num_reg_images(), -m.num_points3D()))
     (Path(out) / LARGEST).mkdir()
     ranked[0].write(Path(out) / LARGEST)

@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import json
+import os
+import signal
 import subprocess
 import sys
+import time
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -134,3 +138,107 @@ def test_pictures_of_two_sizes_are_refused(pictures: Path, tmp_path: Path) -> No
     ended = prepare(mixed, "--out", tmp_path / "scene")
     assert ended.returncode == 3 and "shot009.png is 300 x 240 px" in ended.stderr
     assert not (tmp_path / "scene").exists()
+
+
+def processes_of(folder: Path) -> list[str]:
+    """Return the command lines of living processes that name the folder."""
+    lines = []
+    for process in Path("/proc").glob("[0-9]*/cmdline"):
+        try:
+            lines.append(process.read_bytes().replace(b"\0", b" ").decode(errors="replace"))
+        except OSError:  # it has just ended
+            continue
+    return [line for line in lines if str(folder) in line]
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="looks for processes in /proc")
+@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL], ids=["ctrl-c", "kill"])
+def test_an_interrupted_run_leaves_no_scene_and_the_next_goes_on(
+    scene: Path, pictures: Path, tmp_path: Path, how: signal.Signals
+) -> None:
+    out, stages = tmp_path / "scene", tmp_path / "scene.stages"
+    line = [sys.executable, "-m", "gsdmsr_cli.cli", "prepare", str(pictures), "--out", str(out)]
+    with subprocess.Popen(line, stderr=subprocess.PIPE, text=True) as process:
+        deadline = time.monotonic() + 120
+        while not any("capture.colmap" in line for line in processes_of(stages)):
+            assert process.poll() is None and time.monotonic() < deadline
+            time.sleep(0.05)
+        process.send_signal(how)
+        process.wait(timeout=10)
+        said = process.stderr.read() if process.stderr else ""
+    assert process.returncode == (130 if how == signal.SIGINT else -signal.SIGKILL)
+    assert ("the same command goes on" in said) == (how == signal.SIGINT)
+    while processes_of(stages):  # the child of a killed process notices
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+    assert not out.exists()
+    ended = prepare(pictures, "--out", out, "--json")
+    assert ended.returncode == 0, ended.stderr
+    assert "finding features" not in json.loads(ended.stdout)["seconds"]
+    assert "matching frames" in json.loads(ended.stdout)["seconds"]
+    for name in ("transforms.json", "scene.json", "points.ply"):
+        assert (out / name).read_bytes() == (scene / name).read_bytes()
+
+
+@pytest.mark.skipif(os.name == "nt", reason="needs a limit on the size of files")
+@pytest.mark.parametrize("limit", [20_000, 400_000], ids=["pictures", "database"])
+def test_a_full_disk_is_told_and_leaves_no_scene(
+    pictures: Path, tmp_path: Path, limit: int
+) -> None:
+    import resource
+
+    line = [sys.executable, "-m", "gsdmsr_cli.cli", "prepare", str(pictures)]
+    ended = subprocess.run(
+        [*line, "--out", str(tmp_path / "scene")], capture_output=True, text=True,
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit)),
+    )  # fmt: skip
+    assert ended.returncode == 3, ended.stderr
+    assert "disk full?" in ended.stderr or "free space" in ended.stderr
+    assert ended.stderr.count("\n") == 1 and not (tmp_path / "scene").exists()
+    assert not list((tmp_path / "scene.stages").glob(".*"))
+
+
+def noisy(pictures: np.ndarray) -> room.Shots:
+    rng = np.random.default_rng(0)
+    grainy = (pictures + rng.normal(0, 3, pictures.shape)).clip(0, 255).astype(np.uint8)
+    return room.Shots(grainy, np.zeros((len(pictures), 4, 4)), np.zeros(len(pictures)))
+
+
+def standing_still() -> np.ndarray:
+    return np.stack([room.draw(room.walk(3)[1], 240, 180)[0]] * 10)
+
+
+def unlike_one_another() -> np.ndarray:
+    return np.random.default_rng(0).integers(0, 256, (10, 180, 240, 3), dtype=np.uint8)
+
+
+def without_texture() -> np.ndarray:
+    return np.full((10, 180, 240, 3), 99, np.uint8)
+
+
+def two_halves() -> np.ndarray:
+    back = [
+        room.look_at(np.array([x, 1.2, 0.1]), np.array([x, -2.0, 0.0]))
+        for x in np.linspace(-1, 1, 8)
+    ]
+    there = room.film(room.walk(8), 240, 180).pictures
+    return np.concatenate([there, room.film(np.stack(back), 240, 180).pictures])
+
+
+@pytest.mark.parametrize(
+    ("pictures_of", "message"),
+    [
+        (standing_still, "the camera does not move"),
+        (unlike_one_another, "the frames do not match: only 0 pairs of 10 frames"),
+        (without_texture, "the frames show too little"),
+        (two_halves, "of 16 frames have a camera in one world"),
+    ],
+    ids=lambda value: getattr(value, "__name__", ""),
+)
+def test_captures_without_cameras_are_told_why(
+    tmp_path: Path, pictures_of: Callable[[], np.ndarray], message: str
+) -> None:
+    pictures = room.write_pictures(tmp_path / "pictures", noisy(pictures_of()))
+    ended = prepare(pictures, "--out", tmp_path / "scene")
+    assert ended.returncode == 3 and message in ended.stderr, ended.stderr
+    assert ended.stderr.count("\n") == 1 and not (tmp_path / "scene").exists()
