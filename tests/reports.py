@@ -31,6 +31,7 @@ def small_report() -> dict[str, Any]:
             "progress": 1.0,
             "device": "cpu",
             "processor": "A <fast> & small CPU",
+            "gpu": None,
             "preset": "dnerf",
             "motion": "multiscale",
             "seed": 0,

@@ -8,6 +8,7 @@ from typing import Any
 from gsdmsr_cli import machine
 from gsdmsr_cli.commands._progress import part_of, progress_bar
 from gsdmsr_cli.commands._trained import Trained
+from gsdmsr_cli.cuda import availability
 from gsdmsr_cli.evaluation import protocol
 from gsdmsr_cli.evaluation.catalogue import PARTS, Metric, load_metrics
 from gsdmsr_cli.evaluation.metrics import Missing
@@ -119,6 +120,7 @@ def describe(trained: Trained, request: Request) -> dict[str, Any]:
         "progress": checkpoint.progress,
         "device": trained.device,
         "processor": machine.cpu_name(),
+        "gpu": availability.usage(trained.device)["gpu"],
         "preset": trained.run.name,
         "motion": options.motion["name"],
         "seed": options.training.seed,

@@ -20,8 +20,8 @@ def markdown(heading: str, document: Document, verdicts: Sequence[Verdict]) -> s
         _table(("metric", *colours), summary.metric_rows(document)),
         _table(("split", "PSNR", "views"), summary.split_rows(document)),
         _table(("", ""), summary.other_rows(document)),
-        f"Preset {_text(about['preset'])}, seed {about['seed']}, on {_text(about['processor'])} "
-        f"({about['device']}), gsdmsr {about['versions']['gsdmsr']}, torch "
+        f"Preset {_text(about['preset'])}, seed {about['seed']}, on "
+        f"{_text(summary.machine(document))}, gsdmsr {about['versions']['gsdmsr']}, torch "
         f"{about['versions']['torch']}; data {about['data_fingerprint']}.",
     ]
     return "\n\n".join(parts) + "\n"

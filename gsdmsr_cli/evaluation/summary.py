@@ -70,3 +70,9 @@ def other_rows(document: Document) -> list[tuple[str, str]]:
         ("model", f"{training['splats']:,} splats, {model / 1e6:.2f} MB"),
         ("training", f"{training['steps']:,} steps in {training['train_s']:.0f} s"),
     ]
+
+
+def machine(document: Document) -> str:
+    """Return what the figures were measured on."""
+    about = document["protocol"]
+    return f"{about['gpu'] or about['processor']} ({about['device']})"

@@ -255,7 +255,7 @@ def _protocol(document: Document) -> str:
     pairs: Iterable[tuple[str, str]] = (
         ("pictures", f"{width} x {height} px, the data's sides divided by {about['downscale']}"),
         ("checkpoint", f"{about['checkpoint']}, step {about['checkpoint_step']}"),
-        ("device", f"{about['processor']} ({about['device']})"),
+        ("device", summary.machine(document)),
         ("data", about["data_fingerprint"]),
         *(about["conventions"].items()),
         ("versions", ", ".join(f"{name} {text}" for name, text in about["versions"].items())),

@@ -9,6 +9,7 @@ from reports import small_report
 from gsdmsr_cli.evaluation.gates import Verdict
 from gsdmsr_cli.evaluation.junit import junit
 from gsdmsr_cli.evaluation.markdown import markdown
+from gsdmsr_cli.evaluation.summary import machine
 
 VERDICTS = [
     Verdict("psnr >= 25", True, "psnr is 26"),
@@ -54,3 +55,10 @@ def test_junit_counts_and_names_failures() -> None:
     assert failure is not None and failure.get("message") == 'a|b <i> & "c"'
     properties = {p.get("name"): p.get("value") for p in suite.iter("property")}
     assert properties["psnr"] == "26.123456" and properties["lpips_alex"] == "None"
+
+
+def test_the_machine_is_the_gpu_where_one_computes() -> None:
+    document = small_report()
+    assert machine(document) == "A <fast> & small CPU (cpu)"
+    document["protocol"] |= {"gpu": "A GPU", "device": "cuda"}
+    assert machine(document) == "A GPU (cuda)"
