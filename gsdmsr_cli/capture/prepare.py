@@ -6,16 +6,15 @@ import shutil
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from gsdmsr_cli import __version__
 from gsdmsr_cli.capture import write
 from gsdmsr_cli.capture.child import run_child
 from gsdmsr_cli.capture.consistency import moving_share
+from gsdmsr_cli.capture.convert import write_converted
 from gsdmsr_cli.capture.features import write_features
 from gsdmsr_cli.capture.frames import Frames, read_frames, write_frames
 from gsdmsr_cli.capture.masks import digest, write_given_masks
@@ -28,7 +27,9 @@ from gsdmsr_cli.capture.report import write_page
 from gsdmsr_cli.capture.settle import settle
 from gsdmsr_cli.capture.source import Source
 from gsdmsr_cli.capture.stages import Stages
+from gsdmsr_cli.capture.versions import versions
 from gsdmsr_cli.errors import DataError
+from gsdmsr_cli.formats import read_scene
 
 Tell = Callable[[int, int], None]
 Watch = Callable[[str], AbstractContextManager[Tell]]
@@ -81,10 +82,21 @@ def prepare(
     return work.run("scene", make, test_every=options.test_every)
 
 
-def _versions() -> dict[str, str]:
-    """Return the versions of all that what is written depends on."""
-    packages = ("numpy", "opencv-contrib-python-headless", "OpenImageIO", "pycolmap")
-    return {"gsdmsr": __version__, **{name: metadata.version(name) for name in packages}}
+def convert(folder: Path, stages: Stages, watch: Watch) -> Path:
+    """Return the folder of a published data set's scene, among the stages.
+
+    Raises:
+        DataError: the data set cannot be used; the message says why.
+    """
+    with watch("reading the data set") as tell:
+        scene = read_scene(folder, tell)
+
+    def make(made: Path) -> None:
+        with watch("writing the scene") as tell:
+            write_converted(made, scene, tell)
+
+    key = {"layout": scene.layout, "fingerprint": scene.fingerprint, "versions": versions()}
+    return stages.run("scene", key, make)
 
 
 class _Work:
@@ -97,7 +109,7 @@ class _Work:
         self.source, self.options, self.stages, self.watch = source, options, stages, watch
         with watch("reading the source"):
             self.key: dict[str, Any] = {"source": source.digest(), "kind": source.kind}
-        self.key["versions"] = _versions()
+        self.key["versions"] = versions()
 
     def run(self, name: str, make: Callable[[Path], None], **more: Any) -> Path:
         """Return the stage's folder; from now on everything depends on ``more`` as well."""

@@ -62,7 +62,7 @@ def undistorted(picture: NDArray[np.uint8], lens: Lens) -> NDArray[np.uint8]:
 
 
 def write_transforms(path: Path, views: Sequence[View], points: str) -> None:
-    """Write nerfstudio's description of the views, whose cameras have one lens.
+    """Write nerfstudio's description of the views.
 
     Camera-to-world matrices are in OpenGL axes (y up, z backward); each frame has a time in [0, 1].
 
@@ -71,6 +71,7 @@ def write_transforms(path: Path, views: Sequence[View], points: str) -> None:
         views: pictures are named relative to the file's folder.
         points: name of the file of points.
     """
+    shared = _intrinsics(views[0].camera)
     frames = []
     for view in views:
         frame: dict[str, Any] = {
@@ -78,6 +79,8 @@ def write_transforms(path: Path, views: Sequence[View], points: str) -> None:
             "time": view.time,
             "transform_matrix": _camera_to_world(view.camera),
         }
+        own = _intrinsics(view.camera)
+        frame |= {key: value for key, value in own.items() if value != shared[key]}
         if view.mask_path is not None:
             frame["mask_path"] = view.mask_path.as_posix()
         if view.moving_path is not None:
@@ -87,7 +90,7 @@ def write_transforms(path: Path, views: Sequence[View], points: str) -> None:
         f"{split}_filenames": [v.image_path.as_posix() for v in views if v.split == split]
         for split in SPLITS
     }
-    intrinsics = {"camera_model": "OPENCV", **_intrinsics(views[0].camera)}
+    intrinsics = {"camera_model": "OPENCV", **shared}
     write_json(path, {**intrinsics, "ply_file_path": points, **splits, "frames": frames})
 
 
@@ -131,7 +134,7 @@ def write_note(
     bound: float,
     duration: float | None,
     provenance: Mapping[str, Any],
-    quality: Mapping[str, Any],
+    quality: Mapping[str, Any] | None,
 ) -> None:
     """Write what the scene is and where it comes from.
 
@@ -140,7 +143,7 @@ def write_note(
         bound: see ``Scene.bound``.
         duration: of the capture [s].
         provenance: input, options, versions.
-        quality: the report on the cameras.
+        quality: the report on the cameras, None where they were given.
     """
     document = {
         "gsdmsr": SCHEMA,

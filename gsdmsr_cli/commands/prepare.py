@@ -14,7 +14,7 @@ from rich.console import Console
 from rich.table import Table
 
 from gsdmsr_cli.capture.options import Options
-from gsdmsr_cli.capture.prepare import Masks, prepare, publish
+from gsdmsr_cli.capture.prepare import REPORT, Masks, convert, prepare, publish
 from gsdmsr_cli.capture.report import rows
 from gsdmsr_cli.capture.source import find_source
 from gsdmsr_cli.capture.stages import Stages
@@ -22,6 +22,7 @@ from gsdmsr_cli.capture.write import NOTE
 from gsdmsr_cli.commands._progress import Tell, progress_bar
 from gsdmsr_cli.errors import UsageError
 from gsdmsr_cli.files import read_json, write_json
+from gsdmsr_cli.formats import recognised
 
 TIMINGS = "timings.json"
 """The one file of a scene that differs between runs on the same input."""
@@ -58,7 +59,11 @@ def run(
     stages = Stages(out.with_name(f"{out.name}.stages"))
     clock = _Clock()
     try:
-        scene = prepare(find_source(given, kind), masks, options, stages, clock.watch)
+        if kind is None and recognised(given):
+            _refuse_masks(given, masks, options)
+            scene = convert(given, stages, clock.watch)
+        else:
+            scene = prepare(find_source(given, kind), masks, options, stages, clock.watch)
     except KeyboardInterrupt:
         if stages.root.is_dir():
             text = f"interrupted; finished stages are kept in {shlex.quote(str(stages.root))}"
@@ -71,8 +76,13 @@ def run(
     note = read_json(out / NOTE)
     if as_json:
         Console().out(json.dumps(note | {"seconds": clock.seconds}, indent=2), highlight=False)
-    else:
-        _show(note["quality"], out, sum(clock.seconds.values()))
+        return
+    if note["quality"] is not None:
+        _show(note["quality"], out)
+    console = Console()
+    console.out(f"wrote {out} in {sum(clock.seconds.values()):.0f} s", highlight=False)
+    command = shlex.join(["gsdmsr", "train", "--data", str(out), "--out", "runs/" + out.name])
+    console.out(f"next: {command}", highlight=False)
 
 
 class _Clock:
@@ -89,6 +99,15 @@ class _Clock:
         self.seconds[description] = round(time.perf_counter() - started, 2)
 
 
+def _refuse_masks(given: Path, masks: Masks | None, options: Options) -> None:
+    """Raise UsageError if masks are to serve a data set whose cameras are known."""
+    if masks is not None or options.auto_mask:
+        raise UsageError(
+            f"{given}: is a data set with cameras, for which masks do nothing; drop them, or find "
+            "cameras anew with --format"
+        )
+
+
 def _refuse_used(out: Path, overwrite: bool) -> None:
     """Raise UsageError unless ``out`` is free or an earlier scene that may be replaced."""
     if not out.exists() or (out.is_dir() and not any(out.iterdir())):
@@ -100,7 +119,7 @@ def _refuse_used(out: Path, overwrite: bool) -> None:
         raise UsageError(f"{out}: holds a scene already; give --overwrite or another --out")
 
 
-def _show(quality: dict[str, Any], out: Path, seconds: float) -> None:
+def _show(quality: dict[str, Any], out: Path) -> None:
     console = Console()
     table = Table(show_header=False)
     for what, value in rows(quality):
@@ -108,6 +127,4 @@ def _show(quality: dict[str, Any], out: Path, seconds: float) -> None:
     console.print(table)
     for warning in quality["warnings"]:
         console.out(f"warning: {warning}", highlight=False)
-    console.out(f"wrote {out} in {seconds:.0f} s; the camera's path: {out / 'report.html'}")
-    command = shlex.join(["gsdmsr", "train", "--data", str(out), "--out", "runs/" + out.name])
-    console.out(f"next: {command}", highlight=False)
+    console.out(f"the camera's path: {out / REPORT}", highlight=False)

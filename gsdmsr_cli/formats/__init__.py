@@ -38,6 +38,12 @@ def read_scene(folder: Path, tell: Tell = lambda done, total: None) -> Scene:
         raise DataError(f"data folder {folder} cannot be read: {error}") from error
 
 
+def recognised(folder: Path) -> bool:
+    """Tell whether the folder has a layout that ``read_scene`` knows."""
+    names = plugins.names(__name__)
+    return folder.is_dir() and any(plugins.load(__name__, n).matches(folder) for n in names)
+
+
 def _read(folder: Path, tell: Tell) -> Scene:
     formats = [(name, plugins.load(__name__, name)) for name in plugins.names(__name__)]
     for _, module in formats:
