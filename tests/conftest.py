@@ -9,6 +9,7 @@ from pathlib import Path
 import cuda_shim
 import pytest
 
+from gsdmsr_cli.cuda import availability
 from gsdmsr_cli.synthetic import write_scene
 
 
@@ -36,6 +37,18 @@ def tiny_scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def _shim_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Folder of the CUDA kernels that have been built for the CPU in this session."""
     return tmp_path_factory.mktemp("shim")
+
+
+@pytest.fixture(params=["cpu", "cuda"])
+def place(request: pytest.FixtureRequest) -> str:
+    """Where tensors lie that CUDA kernels run on: in the memory of the CPU, and of a GPU."""
+    if request.param == "cuda":
+        reason = availability.missing()
+        if reason is not None:
+            pytest.skip(reason)
+    else:
+        request.getfixturevalue("kernels_on_the_cpu")
+    return str(request.param)
 
 
 @pytest.fixture(scope="module")

@@ -32,7 +32,7 @@ def unavailable(device: str) -> str | None:
 
 @cache
 def _disagreement() -> str | None:
-    return disagreement(rasterize, "cuda")
+    return disagreement(rasterize, compare, "cuda")
 
 
 def rasterize(

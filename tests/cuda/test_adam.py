@@ -5,7 +5,6 @@ from __future__ import annotations
 import pytest
 import torch
 from kernel_checks import generator
-from torch import Tensor
 
 from gsdmsr_cli.cuda.adam import Row, adam
 from gsdmsr_cli.cuda.compiler import MOST_TENSORS
@@ -31,38 +30,38 @@ def exact(of: Move) -> Move:
     return Move(*doubles, of.step, of.rate, gate)
 
 
-def row(of: Move) -> Row:
+def row(of: Move, place: str = "cpu") -> Row:
     step, inverse2 = of.rate / (1 - BETA1**of.step), 1 / (1 - BETA2**of.step)
-    gate = () if of.gate is None else tuple(of.gate)
-    return Row(*of[:4], step, inverse2, *gate)
+    gate = () if of.gate is None else (part.to(place) for part in of.gate)
+    return Row(*(tensor.to(place) for tensor in of[:4]), step, inverse2, *gate)
 
 
-def assert_same_steps(moves: list[Move]) -> None:
-    expected = [exact(of) for of in moves]
+def assert_same_steps(place: str, moves: list[Move]) -> None:
+    expected, rows = [exact(of) for of in moves], [row(of, place) for of in moves]
     adam_steps_twin(expected)
-    adam([row(of) for of in moves], BETA1, BETA2, EPS)
-
-    def parts(of: Move) -> list[Tensor]:
-        return [of.tensor, of.first, of.second, *([] if of.gate is None else [of.gate.trace])]
-
-    for found, truth in zip(moves, expected, strict=True):
-        for one, other in zip(parts(found), parts(truth), strict=True):
-            torch.testing.assert_close(one.double(), other, atol=1e-6, rtol=1e-5)
+    adam(rows, BETA1, BETA2, EPS)
+    for found, truth in zip(rows, expected, strict=True):
+        pairs = [(found.values, truth.tensor), (found.first, truth.first)]
+        pairs.append((found.second, truth.second))
+        if truth.gate is not None and found.trace is not None:
+            pairs.append((found.trace, truth.gate.trace))
+        for one, other in pairs:
+            torch.testing.assert_close(one.cpu().double(), other, atol=1e-6, rtol=1e-5)
 
 
 @pytest.mark.parametrize("gated", [False, True])
 @pytest.mark.parametrize("shape", [(1,), (1000,), (257, 3), (65, 4, 3), (0, 3)])
-def test_one_tensor(shape: tuple[int, ...], gated: bool) -> None:
-    assert_same_steps([move(shape, 0, gated)])
+def test_one_tensor(place: str, shape: tuple[int, ...], gated: bool) -> None:
+    assert_same_steps(place, [move(shape, 0, gated)])
 
 
-def test_more_tensors_than_one_launch_moves() -> None:
-    assert_same_steps([move((5 + i, 3), i, i % 2 == 0) for i in range(MOST_TENSORS + 3)])
+def test_more_tensors_than_one_launch_moves(place: str) -> None:
+    assert_same_steps(place, [move((5 + i, 3), i, i % 2 == 0) for i in range(MOST_TENSORS + 3)])
 
 
-def test_more_values_than_threads() -> None:
+def test_more_values_than_threads(place: str) -> None:
     """A thread of the largest grid then moves more than one value."""
-    assert_same_steps([move((300_000,), 1, False), move((3, 2), 2, True)])
+    assert_same_steps(place, [move((300_000,), 1, False), move((3, 2), 2, True)])
 
 
 def test_rows_without_a_factor_keep_their_bits() -> None:

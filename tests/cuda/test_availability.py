@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
@@ -11,6 +12,7 @@ from gsdmsr_cli import raster
 from gsdmsr_cli.cuda import availability, launch, room
 from gsdmsr_cli.errors import DataError, GsdmsrError
 from gsdmsr_cli.raster import _check, cpu, cuda
+from gsdmsr_cli.splats import Splats
 
 
 @pytest.fixture
@@ -69,12 +71,12 @@ def test_a_gpu_that_draws_otherwise_is_not_relied_on(machine: pytest.MonkeyPatch
 
 
 def test_a_healthy_engine_agrees_with_the_reference() -> None:
-    assert _check.disagreement(cpu.rasterize, "cpu") is None
+    assert _check.disagreement(cpu.rasterize, cpu.compare, "cpu") is None
 
 
 @pytest.mark.usefixtures("kernels_on_the_cpu")
 def test_the_kernels_agree_with_the_reference() -> None:
-    assert _check.disagreement(cuda.rasterize, "cpu") is None
+    assert _check.disagreement(cuda.rasterize, cuda.compare, "cpu") is None
 
 
 def test_kernels_that_do_nothing_are_found_out(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -86,22 +88,43 @@ def test_kernels_that_do_nothing_are_found_out(monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setattr(room.Room, "find", lambda *_: 1)
     # memory that nobody has written to may hold anything
     monkeypatch.setattr(torch.Tensor, "new_empty", torch.Tensor.new_zeros)
-    assert _check.disagreement(cuda.rasterize, "cpu") == "the picture of a test drawing is wrong"
+    assert (
+        _check.disagreement(cuda.rasterize, cuda.compare, "cpu")
+        == "the picture of a test drawing is wrong"
+    )
 
 
-def test_wrong_gradients_are_found_out() -> None:
+def doubled(splats: Splats) -> Splats:
+    """The same values, whose rotations get twice their gradient."""
+    return replace(splats, quats=2 * splats.quats - splats.quats.detach())
+
+
+def test_wrong_gradients_of_drawing_are_found_out() -> None:
     wrong = _check.disagreement(
-        lambda splats, *given: cpu.rasterize(
-            replace(splats, quats=2 * splats.quats - splats.quats.detach()), *given
-        ),
-        "cpu",
+        lambda splats, *given: cpu.rasterize(doubled(splats), *given), cpu.compare, "cpu"
     )
     assert wrong == "the gradient of quats of a test drawing is wrong"
+
+
+def test_wrong_gradients_of_comparing_are_found_out() -> None:
+    wrong = _check.disagreement(
+        cpu.rasterize, lambda splats, *given: cpu.compare(doubled(splats), *given), "cpu"
+    )
+    assert wrong == "the gradient of quats of a test drawing is wrong"
+
+
+def test_a_wrong_loss_is_found_out() -> None:
+    def compare(*given: Any) -> raster.Comparison:
+        found = cpu.compare(*given)
+        return found._replace(loss=found.loss * 1.01)
+
+    wrong = _check.disagreement(cpu.rasterize, compare, "cpu")
+    assert wrong == "the loss of a test drawing is wrong"
 
 
 def test_a_driver_that_fails_is_told_of() -> None:
     def draw(*_: object) -> None:
         raise GsdmsrError("the NVIDIA driver failed when launching project: no image (209)")
 
-    said = _check.disagreement(draw, "cpu")
+    said = _check.disagreement(draw, cpu.compare, "cpu")
     assert said is not None and said.startswith("it fails a test drawing: the NVIDIA driver failed")

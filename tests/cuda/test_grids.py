@@ -38,11 +38,12 @@ def points(count: int) -> Tensor:
     return 1.6 * torch.randn(count, 3, generator=generator(3))
 
 
-def compare(some: list[planes.Level], count: int, time: float, beside: int = 0) -> None:
+def compare(place: str, some: list[planes.Level], count: int, time: float, beside: int = 0) -> None:
     given = [points(count), torch.randn(count, beside, generator=generator(4)), *tensors_of(some)]
     ours, exact = leaves(given, torch.float32), leaves(given, torch.float64)
     to_cube = planes._to_cube(BOX).tolist()
-    found = grids.lookup(*ours[:2], time, to_cube, ours[2:])
+    there = [tensor.to(place) for tensor in ours]
+    found = grids.lookup(*there[:2], time, to_cube, there[2:]).cpu()
     expected = planes.lookup_twin(levels_of(exact[2:]), exact[0], time, BOX, exact[1])
     assert_near(found, expected, TOLERANCE, "features")
     slope = torch.randn(expected.shape, generator=generator(5))
@@ -55,13 +56,13 @@ def compare(some: list[planes.Level], count: int, time: float, beside: int = 0) 
 
 
 @pytest.mark.parametrize("time", [-1.0, -0.37, 0.0, 1.0, 1.4])
-def test_features_and_gradients_at_all_times(time: float) -> None:
-    compare(levels((5, 4, 16)), 33, time)
+def test_features_and_gradients_at_all_times(place: str, time: float) -> None:
+    compare(place, levels((5, 4, 16)), 33, time)
 
 
 @pytest.mark.parametrize("count", [1, 15, 16, 17, 300])
-def test_any_number_of_points(count: int) -> None:
-    compare(levels((4, 3, 32), (9, 5, 16)), count, 0.2, beside=3)
+def test_any_number_of_points(place: str, count: int) -> None:
+    compare(place, levels((4, 3, 32), (9, 5, 16)), count, 0.2, beside=3)
 
 
 def test_no_points_have_no_features_and_teach_nothing() -> None:
@@ -74,8 +75,8 @@ def test_no_points_have_no_features_and_teach_nothing() -> None:
         assert tensor.grad is not None and not tensor.grad.any()
 
 
-def test_the_smallest_grid() -> None:
-    compare(levels((2, 2, 16)), 20, 0.5)
+def test_the_smallest_grid(place: str) -> None:
+    compare(place, levels((2, 2, 16)), 20, 0.5)
 
 
 def test_points_that_need_no_gradient_get_none() -> None:
@@ -94,10 +95,10 @@ def test_too_many_levels_are_refused() -> None:
 
 
 @pytest.mark.parametrize("shapes", [[(2, 2, 16)], [(5, 3, 32)], [(4, 7, 16), (9, 4, 16)]])
-def test_penalties_and_their_gradients(shapes: list[tuple[int, int, int]]) -> None:
+def test_penalties_and_their_gradients(place: str, shapes: list[tuple[int, int, int]]) -> None:
     given = tensors_of(levels(*shapes))
     ours, exact = leaves(given, torch.float32), leaves(given, torch.float64)
-    found = grids.penalty((0.3, 0.7, 0.2), ours)
+    found = grids.penalty((0.3, 0.7, 0.2), [tensor.to(place) for tensor in ours]).cpu()
     expected = planes.penalty_twin(levels_of(exact), 0.3, 0.7, 0.2)
     assert_near(found, expected, TOLERANCE, "value")
     (3 * found).backward()

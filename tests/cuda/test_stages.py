@@ -59,12 +59,13 @@ def assert_near(found: Tensor, expected: Tensor, tolerance: float = 1e-4) -> Non
 
 @pytest.mark.parametrize("ssim", [0.0, 0.2])
 @pytest.mark.parametrize("moves", [False, True], ids=["at rest", "moving"])
-def test_views_at_once_are_the_views_one_by_one(ssim: float, moves: bool) -> None:
-    base = splats(70)
+def test_views_at_once_are_the_views_one_by_one(place: str, ssim: float, moves: bool) -> None:
+    base = splats(70).map(lambda t: t.detach().to(place).requires_grad_())
     shifts = [torch.zeros(70, 3), 0.2 * torch.randn(70, 3, generator=generator(5)), torch.ones(3)]
+    shifts = [shift.to(place) for shift in shifts]
     moments = [replace(base, means=base.means + s) if moves else base for s in shifts]
     cameras = [camera(angle) for angle in (0.1, 1.0, 2.5)]
-    targets = [target(seed) for seed in range(3)]
+    targets = [target(seed).to(place) for seed in range(3)]
     leaves = list(base.tensors().values())
     together, views = cuda.compare_views(moments, cameras, BACKGROUND, targets, ssim)
     found = torch.autograd.grad(together, leaves, retain_graph=True)
@@ -157,13 +158,14 @@ def test_entries_of_a_tile_lie_front_to_back_and_name_blocks() -> None:
 
 
 @pytest.mark.parametrize("size", [(1, 1), (5, 40), (16, 16), (35, 22)])
-def test_the_loss_is_that_of_its_twin(size: tuple[int, int]) -> None:
+def test_the_loss_is_that_of_its_twin(place: str, size: tuple[int, int]) -> None:
     width, height = size
     view = stages.views_of([camera(0.0, width, height)] * 2)
     rgb = torch.rand(2, 3, height, width, generator=generator())
     shape = 3, height, width
     targets = [torch.randint(256, shape, generator=generator(s), dtype=torch.uint8) for s in (1, 2)]
-    losses, gradient = stages.compare(view, rgb, targets, 0.2)
+    there = [wanted.to(place) for wanted in targets]
+    losses, gradient = (t.cpu() for t in stages.compare(view, rgb.to(place), there, 0.2))
     for i, wanted in enumerate(targets):
         exact = rgb[i].permute(1, 2, 0).double().requires_grad_()
         loss = photometric_loss_twin(exact, wanted, 0.2)
