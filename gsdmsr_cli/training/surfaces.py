@@ -64,7 +64,7 @@ def sample_points(
     rays = -(-CANDIDATES * count // len(senders))
     found = [_sweep(album, sender, rays, generator) for sender in senders]
     means, colours, clearness = (torch.cat(parts) for parts in zip(*found, strict=True))
-    rows = torch.multinomial(clearness + 1e-3, count, generator=generator)
+    rows = torch.multinomial(clearness + 1e-6, count, generator=generator)
     return Points(means[rows], colours[rows])
 
 
@@ -113,6 +113,17 @@ class _Album:
             self._loaded[row] = torch.from_numpy(small).permute(2, 0, 1).contiguous()
         return self._loaded[row]
 
+    def counted(self, row: int, pixels: Tensor) -> Tensor:
+        """Return which pixels (P, 2) of a shrunk picture count, (P,) bool."""
+        counted = self._pictures.counted(self._views[row])
+        if counted is None:
+            return torch.ones(len(pixels), dtype=torch.bool)
+        height, width = counted.shape
+        camera = self.cameras[row]
+        column = (pixels[:, 0] * (width / camera.width)).long().clamp(max=width - 1)
+        line = (pixels[:, 1] * (height / camera.height)).long().clamp(max=height - 1)
+        return counted[line, column]
+
 
 def _shrunk(camera: Camera) -> Camera:
     by = max(1.0, min(camera.width, camera.height) / SIDE)
@@ -124,7 +135,8 @@ def _sweep(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return a point on each of some random rays of a view, its colour, and how clear its depth is.
 
-    Clear is, in [0, 1], what agrees much better at one depth than at the others.
+    Clear is what agrees much better at one depth than at the others, up to 1; 0 is what does not
+    count.
     """
     camera = album.cameras[row]
     at = torch.rand(rays, 2, generator=generator) * torch.tensor([camera.width, camera.height])
@@ -138,7 +150,7 @@ def _sweep(
     # of equals, as where there are no partners, any may be taken
     cost += 1e-6 * torch.rand(rays, DEPTHS, generator=generator)
     least, index = cost.min(dim=1)
-    clearness = 1 - least / cost.median(dim=1).values
+    clearness = (1e-3 + 1 - least / cost.median(dim=1).values) * album.counted(row, at)
     best = inverse.gather(1, index[:, None])
     inverse = (best + step * torch.linspace(-1, 1, FINER)).clamp(far, near)
     index = _cost(album, row, patch, wanted, inverse).argmin(dim=1)

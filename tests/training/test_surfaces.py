@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from datasets import write_picture
 from kernel_checks import generator
 from torch import Tensor
 
@@ -91,6 +92,17 @@ def test_a_single_view_has_rays_but_no_depths() -> None:
     pixels = pictures.load(scene.views[0])[:, row.long(), column.long()].T / 255
     assert (points.colours - pixels).abs().mean() < 0.05
     assert points.means.norm(dim=1).std() > 0.1
+
+
+def test_pixels_that_do_not_count_send_no_rays(tmp_path: Path) -> None:
+    scene, pictures = capture(12)
+    mask = np.zeros((80, 96, 1), np.uint8)
+    mask[:, :48] = 255
+    write_picture(tmp_path / "mask.png", mask)
+    views = tuple(replace(view, mask_path=tmp_path / "mask.png") for view in scene.views)
+    points = sample_points(replace(scene, views=views), pictures, 300, generator(0))
+    # the left half of each camera's picture is x < 0 on the wall, but for turns of its head
+    assert (points.means[:, 0] < 0.4).float().mean() > 0.95
 
 
 def test_surfaces_join_points_that_are_too_few() -> None:
