@@ -81,6 +81,13 @@ def prepare(
         Literal["video", "images"] | None,
         typer.Option("--format", help="What INPUT is, where it is not plain."),
     ] = None,
+    rig: Annotated[
+        bool, typer.Option("--rig", help="The videos are those of cameras that stand still.")
+    ] = False,
+    offset: Annotated[
+        list[str] | None,
+        typer.Option(metavar="CAMERA=S", help="Seconds its clock is ahead; repeatable."),
+    ] = None,
     frames: Annotated[int, typer.Option(min=8, metavar="N", help="Most frames to take.")] = 60,
     max_side: Annotated[
         int, typer.Option(min=64, metavar="N", help="Longer side of the pictures [px].")
@@ -130,10 +137,17 @@ def prepare(
         raise UsageError("--masks and --auto-mask are both given; drop one")
     if invert_masks and masks is None:
         raise UsageError("--invert-masks needs --masks")
+    if rig and (format_ == "images" or masks is not None or auto_mask):
+        raise UsageError("--rig takes videos, and finds cameras where nothing moves: no masks")
+    if offset and not rig:
+        raise UsageError("--offset is for the cameras of a --rig")
+    from gsdmsr_cli.capture.rig import parse_offsets
+
     if camera_model not in CAMERA_MODELS:
         raise UsageError(f"--camera-model {camera_model}: {nearest(camera_model, CAMERA_MODELS)}")
     options = Options(
         frames=frames,
+        offsets=parse_offsets(offset or []),
         max_side=max_side,
         features=features,
         camera_model=camera_model,
@@ -148,7 +162,8 @@ def prepare(
     from gsdmsr_cli.commands import prepare as command
 
     given_masks = None if masks is None else Masks(masks, invert_masks)
-    command.run(given, out, format_, given_masks, options, overwrite, keep_stages, as_json)
+    kind = "rig" if rig else format_
+    command.run(given, out, kind, given_masks, options, overwrite, keep_stages, as_json)
 
 
 @app.command()

@@ -33,9 +33,10 @@ BLURRED = 0.2
 NEIGHBOURS = 5
 """So many frames before and after one are its neighbours."""
 
+PICTURES, NOTE = "pictures", "frames.json"
+"""Folder and file that ``read_frames`` reads."""
+
 _LOOKED_AT = 640  # longer side at which sharpness is measured [px]
-_PICTURES = "pictures"
-_NOTE = "frames.json"
 
 
 @dataclass(frozen=True)
@@ -108,24 +109,24 @@ def write_frames(folder: Path, source: Source, count: int, max_side: int, tell: 
             f"{source.root}: {len(taken)} usable frames of {len(candidates)}; at least {LEAST} are "
             "needed: film for longer, or give more pictures"
         )
-    (folder / _PICTURES).mkdir()
+    (folder / PICTURES).mkdir()
     names = tuple(f"{i:05d}.png" for i in range(len(taken)))
     original_sizes = []
     for i, picture in enumerate(_pictures(source, taken, notes)):
-        shrunk = _shrunk(picture, max_side)
+        small = shrunk(picture, max_side)
         original_sizes.append((picture.shape[1], picture.shape[0]))
         if original_sizes[-1] != original_sizes[0]:
             raise DataError(
                 f"{source.root}: {taken[i].file} is {_size(picture)} px, unlike {taken[0].file}; "
                 "all must have one size: they share one lens"
             )
-        write_png(folder / _PICTURES / names[i], shrunk)
+        write_png(folder / PICTURES / names[i], small)
         tell(len(candidates) + i + 1, len(candidates) + len(taken))
-    size = shrunk.shape[1], shrunk.shape[0]
+    size = small.shape[1], small.shape[0]
     focals = {note.focal for note in notes.values()}
     focal = focals.pop() if len(focals) == 1 else None
     write_json(
-        folder / _NOTE,
+        folder / NOTE,
         {
             "frames": [asdict(frame) for frame in taken],
             "blurred": [asdict(frame) for frame in blurred],
@@ -140,10 +141,10 @@ def write_frames(folder: Path, source: Source, count: int, max_side: int, tell: 
 
 def read_frames(folder: Path) -> Frames:
     """Return what ``write_frames`` has written."""
-    note: dict[str, Any] = read_json(folder / _NOTE)
+    note: dict[str, Any] = read_json(folder / NOTE)
     taken = tuple(Candidate(**frame) for frame in note["frames"])
     return Frames(
-        folder=folder / _PICTURES,
+        folder=folder / PICTURES,
         names=tuple(f"{i:05d}.png" for i in range(len(taken))),
         taken=taken,
         of_pictures=note["of_pictures"],
@@ -184,7 +185,7 @@ def leave_out_blurred(chosen: Sequence[Candidate]) -> tuple[list[Candidate], lis
 
 def sharpness(picture: Picture) -> float:
     """Return the variance of the Laplacian of (H, W, C) pixels at a common size."""
-    grey = cv2.cvtColor(_shrunk(picture, _LOOKED_AT), cv2.COLOR_RGB2GRAY)
+    grey = cv2.cvtColor(shrunk(picture, _LOOKED_AT), cv2.COLOR_RGB2GRAY)
     return float(cv2.Laplacian(grey, cv2.CV_32F).var())
 
 
@@ -261,7 +262,8 @@ def _rgb(picture: Picture) -> Picture:
     return picture[..., :3] if picture.shape[2] >= 3 else np.repeat(picture[..., :1], 3, axis=2)
 
 
-def _shrunk(picture: Picture, max_side: int) -> Picture:
+def shrunk(picture: Picture, max_side: int) -> Picture:
+    """Return (H, W, 3) pixels whose longer side is at most ``max_side``, by averaging areas."""
     height, width, _ = picture.shape
     scale = max_side / max(width, height)
     if scale >= 1:

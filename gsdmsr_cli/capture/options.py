@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
-KINDS = ("video", "images")
 CAMERA_MODELS = (
     "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE",
 )  # fmt: skip
@@ -17,7 +17,8 @@ class Options:
     """How a capture becomes a scene; every value changes what is written.
 
     Attributes:
-        frames: most frames to take.
+        frames: most frames to take, of each camera.
+        offsets: seconds by which the clocks of a rig's cameras are ahead, by name.
         max_side: longer side of the pictures, which are shrunk to it [px].
         features: most features of a frame.
         camera_model: COLMAP's name of the lens that all frames share.
@@ -26,11 +27,13 @@ class Options:
         auto_mask: whether what moves is looked for, with the cameras of a first pass.
         mapping: COLMAP's incremental mapper or its global one.
         min_registered: share of the frames whose cameras must be found.
-        test_every: every so many frames one is kept for testing; 0 keeps none.
+        test_every: every so many frames one is kept for testing; 0 keeps none. Of a rig it is the
+            first camera.
         seed: of COLMAP's random choices.
     """
 
     frames: int = 60
+    offsets: Mapping[str, float] = field(default_factory=dict)
     max_side: int = 1600
     features: int = 2048
     camera_model: str = "SIMPLE_RADIAL"

@@ -24,6 +24,7 @@ from gsdmsr_cli.capture.pairs import choose_pairs
 from gsdmsr_cli.capture.quality import assess
 from gsdmsr_cli.capture.reconstruction import Reconstruction, read_reconstruction
 from gsdmsr_cli.capture.report import write_page
+from gsdmsr_cli.capture.rig import Rig, read_rig, write_rig
 from gsdmsr_cli.capture.settle import settle
 from gsdmsr_cli.capture.source import Source
 from gsdmsr_cli.capture.stages import Stages
@@ -77,7 +78,8 @@ def prepare(
 
     def make(folder: Path) -> None:
         with watch("writing the scene") as tell:
-            _write_scene(folder, frames, moving, found, options, provenance, quality, tell)
+            given = frames, work.rig, moving, found, options
+            _write_scene(folder, *given, provenance, quality, tell)
 
     return work.run("scene", make, test_every=options.test_every)
 
@@ -107,6 +109,7 @@ class _Work:
 
     def __init__(self, source: Source, options: Options, stages: Stages, watch: Watch) -> None:
         self.source, self.options, self.stages, self.watch = source, options, stages, watch
+        self.rig: Rig | None = None
         with watch("reading the source"):
             self.key: dict[str, Any] = {"source": source.digest(), "kind": source.kind}
         self.key["versions"] = versions()
@@ -122,14 +125,23 @@ class _Work:
 
         def choose(folder: Path) -> None:
             with self.watch("choosing frames") as tell:
-                write_frames(folder, self.source, options.frames, options.max_side, tell)
+                given = folder, self.source, options.frames, options.max_side
+                if self.source.kind == "rig":
+                    write_rig(*given, options.offsets, tell)
+                else:
+                    write_frames(*given, tell)
 
         def find(folder: Path) -> None:
             with self.watch("finding features") as tell:
                 pictures = [frames.folder / name for name in frames.names]
                 write_features(folder, pictures, options.features, tell)
 
-        chosen = self.run("frames", choose, frames=options.frames, max_side=options.max_side)
+        chosen = self.run(
+            "frames", choose, frames=options.frames, max_side=options.max_side,
+            offsets=dict(options.offsets),
+        )  # fmt: skip
+        if self.source.kind == "rig":
+            self.rig = read_rig(chosen)
         frames = read_frames(chosen)
         return frames, self.run("features", find, features=options.features)
 
@@ -205,6 +217,7 @@ def require_registered(frames: Frames, found: Reconstruction, least: float) -> N
 def _write_scene(
     folder: Path,
     frames: Frames,
+    rig: Rig | None,
     masks: Path | None,
     found: Reconstruction,
     options: Options,
@@ -213,16 +226,22 @@ def _write_scene(
     tell: Tell,
 ) -> None:
     when = dict(zip(frames.names, frames.times, strict=True))
-    views, points, bound = settle(found, [when[n] for n in found.names], options.test_every)
+    every = 0 if rig else options.test_every
+    views, points, bound = settle(found, [when[n] for n in found.names], every)
+    cameras = views
+    if rig is not None:
+        views = rig.views(views)
     if masks is not None:
         views = write.write_masks(folder, masks, views, found.lens)
-    write.write_pictures(folder, frames.folder, views, found.lens, tell)
+    pictures = frames.folder if rig is None else rig.folder
+    write.write_pictures(folder, pictures, views, found.lens, tell)
     write.write_transforms(folder / "transforms.json", views, POINTS)
-    trusted = found.tracks >= TRUSTED
+    trusted = found.tracks >= (TRUSTED if rig is None else 2)
     write.write_points(folder / POINTS, points[trusted], found.colours[trusted])
     title = f"Cameras of {provenance['input']['name']}"
-    write_page(folder / REPORT, title, quality, views, np.asarray(points[trusted]))
-    write.write_note(folder / write.NOTE, bound, frames.duration, provenance, quality)
+    write_page(folder / REPORT, title, quality, cameras, np.asarray(points[trusted]))
+    duration = frames.duration if rig is None else rig.times[-1]
+    write.write_note(folder / write.NOTE, bound, duration, provenance, quality)
 
 
 def publish(scene: Path, out: Path) -> None:

@@ -179,7 +179,7 @@ def warnings(report: Mapping[str, Any]) -> list[str]:
             "camera that hardly moves: expect depth to be a guess and new views to hold only near "
             "the path; film again while walking round the scene"
         )
-    if report["track_length"] < TRACK:
+    if report["track_length"] < min(TRACK, frames["registered"] / 2):
         found.append(
             f"points are found in only {report['track_length']:.1f} frames on average: take more "
             "--frames, or film more slowly"

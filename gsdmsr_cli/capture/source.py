@@ -1,9 +1,9 @@
-"""What was given to ``prepare``: one camera's videos or its pictures."""
+"""What was given to ``prepare``: one camera's videos or pictures, or the videos of a rig."""
 
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from gsdmsr_cli.errors import DataError
@@ -19,7 +19,7 @@ class Source:
     """Where frames come from.
 
     Attributes:
-        kind: "video" or "images".
+        kind: "video", "images" or "rig".
         root: the file or folder that was given.
         files: the videos or pictures, in the order of their names.
     """
@@ -45,6 +45,8 @@ def find_source(path: Path, kind: str | None = None) -> Source:
     Raises:
         DataError: there is nothing there, or nothing of that kind, or more than one kind.
     """
+    if kind == "rig":
+        return replace(find_source(path, "video"), kind="rig")
     if path.is_file():
         if kind == "images":
             raise DataError(f"{path}: is a file; --format images takes a folder of pictures")
