@@ -52,9 +52,9 @@ def place(request: pytest.FixtureRequest) -> str:
 
 
 @pytest.fixture(scope="module")
-def kernels_on_the_cpu(_shim_folder: Path) -> Iterator[None]:
+def kernels_on_the_cpu(_shim_folder: Path) -> Iterator[cuda_shim.Shim]:
     """Let CUDA kernels run on tensors in the memory of the CPU."""
     if cuda_shim.MISSING:
         pytest.skip(cuda_shim.MISSING)
-    with cuda_shim.on_the_cpu(_shim_folder):
-        yield
+    with cuda_shim.on_the_cpu(_shim_folder) as shim:
+        yield shim

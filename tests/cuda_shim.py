@@ -25,9 +25,14 @@ def kernels_of(source: str) -> list[str]:
 
 
 class Shim:
-    """Runs kernels on tensors in the memory of the CPU, see ``launch.Runner``."""
+    """Runs kernels on tensors in the memory of the CPU, see ``launch.Runner``.
+
+    Attributes:
+        backwards: whether blocks, warps and lanes take turns in the opposite order.
+    """
 
     def __init__(self, folder: Path) -> None:
+        self.backwards = False
         self._folder = folder
         self._libraries: dict[str, ctypes.CDLL] = {}
 
@@ -42,6 +47,7 @@ class Shim:
     ) -> None:
         if source not in self._libraries:
             self._libraries[source] = ctypes.CDLL(str(self._build(source)))
+        self._libraries[source].take_turns(ctypes.c_bool(self.backwards))
         getattr(self._libraries[source], f"run_{kernel}")(*grid, block, arguments)
 
     def _build(self, source: str) -> Path:
@@ -51,6 +57,9 @@ class Shim:
             f"    shim::run_grid(x, y, threads, work, given);\n}}\n"
             for kernel in kernels_of(source)
         ]
+        runners.append(
+            'extern "C" void take_turns(bool backwards) { shim::backwards = backwards; }'
+        )
         text = f'#include "shim.h"\n#include "{source}.cu"\n' + "".join(runners)
         program, library = self._folder / f"{source}.cpp", self._folder / f"{source}.so"
         if library.is_file():
@@ -69,9 +78,12 @@ class Shim:
 @contextmanager
 def on_the_cpu(folder: Path) -> Iterator[Shim]:
     """Let kernels of tensors in the memory of the CPU be run by the shim."""
-    shim = Shim(folder)
+    earlier, shim = launch.runners.get("cpu"), Shim(folder)
     launch.runners["cpu"] = shim
     try:
         yield shim
     finally:
-        del launch.runners["cpu"]
+        if earlier is None:
+            del launch.runners["cpu"]
+        else:
+            launch.runners["cpu"] = earlier

@@ -2,7 +2,8 @@
 //
 // Blocks run one after another. The threads of a block are fibers: each runs until it waits for its
 // warp or its block, then the next one's turn comes. So results do not depend on timing, and a kernel
-// whose threads do not all reach a barrier is told of instead of hanging.
+// whose threads do not all reach a barrier is told of instead of hanging. Turns can be taken in the
+// opposite order: what is missing a barrier then has another result.
 #pragma once
 #include <algorithm>
 #include <cmath>
@@ -74,6 +75,10 @@ inline jmp_buf scheduler;
 inline void (*work)(void *);
 inline void *work_arguments;
 inline unsigned long progress;
+inline bool backwards;
+
+// The place of turn i of n.
+inline int turn(int i, int n) { return backwards ? n - 1 - i : i; }
 
 inline void open(Barrier &barrier) {
     barrier.waiting = 0;
@@ -131,8 +136,10 @@ inline bool run_warp(int first, int last) {
     for (unsigned long before = progress - 1; before != progress;) {
         before = progress;
         left = false;
-        for (int i = first; i < last; i++)
+        for (int k = 0; k < last - first; k++) {
+            int i = first + turn(k, last - first);
             if (!fibers[i].ended) resume(i), left = left || !fibers[i].ended;
+        }
     }
     return left;
 }
@@ -151,8 +158,10 @@ inline void run_block() {
     for (bool left = true; left;) {
         unsigned long before = progress;
         left = false;
-        for (int first = 0; first < threads; first += WARP_SIZE)
+        for (int k = 0; k < (int)warps.size(); k++) {
+            int first = turn(k, (int)warps.size()) * WARP_SIZE;
             left |= run_warp(first, std::min(first + WARP_SIZE, threads));
+        }
         if (left && before == progress) {
             fprintf(stderr, "shim: threads wait for others that never come\n");
             abort();
@@ -166,7 +175,7 @@ inline void run_grid(int blocks_x, int blocks_y, int threads, void (*kernel)(voi
     block_size = {(unsigned)threads, 1, 1};
     for (int y = 0; y < blocks_y; y++)
         for (int x = 0; x < blocks_x; x++) {
-            block = {(unsigned)x, (unsigned)y, 0};
+            block = {(unsigned)turn(x, blocks_x), (unsigned)turn(y, blocks_y), 0};
             run_block();
         }
 }
