@@ -113,8 +113,8 @@ def prepare(
         bool, typer.Option("--auto-mask", help="Look for what moves, in a first pass.")
     ] = False,
     mapping: Annotated[
-        Literal["incremental", "global"], typer.Option(help="COLMAP's mapper.")
-    ] = "incremental",
+        Literal["global", "incremental"], typer.Option(help="COLMAP's mapper.")
+    ] = "global",
     min_registered: Annotated[
         float, typer.Option(min=0.0, max=1.0, metavar="X", help="Share that must have cameras.")
     ] = 0.75,

@@ -51,5 +51,6 @@ def why_no_model(colmap: Any, database: Path) -> str:
         )
     return (
         f"no two of {len(images)} frames have been taken from places far enough apart: the camera "
-        "only turns, or hardly moves; walk round the scene while filming"
+        "only turns, or hardly moves, or something large moves with it: walk round the scene while "
+        "filming, or give --masks of what moves"
     )

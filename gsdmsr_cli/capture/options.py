@@ -9,7 +9,6 @@ CAMERA_MODELS = (
     "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE",
 )  # fmt: skip
 MATCHINGS = ("auto", "sequential", "exhaustive", "both")
-MAPPINGS = ("incremental", "global")
 
 
 @dataclass(frozen=True)
@@ -25,7 +24,7 @@ class Options:
         matching: which frames are compared: neighbours in time, all, or neighbours and, of a few
             evenly chosen, all; ``auto`` is exhaustive for small folders of pictures.
         auto_mask: whether what moves is looked for, with the cameras of a first pass.
-        mapping: COLMAP's incremental mapper or its global one.
+        mapping: COLMAP's global mapper or its incremental one.
         min_registered: share of the frames whose cameras must be found.
         test_every: every so many frames one is kept for testing; 0 keeps none. Of a rig it is the
             first camera.
@@ -39,7 +38,7 @@ class Options:
     camera_model: str = "SIMPLE_RADIAL"
     matching: str = "auto"
     auto_mask: bool = False
-    mapping: str = "incremental"
+    mapping: str = "global"
     min_registered: float = 0.75
     test_every: int = 8
     seed: int = 0

@@ -120,7 +120,7 @@ def test_an_earlier_scene_is_replaced_only_if_asked(scene: Path, pictures: Path)
 
 def test_a_film_gives_a_scene_in_seconds(shots: room.Shots, tmp_path: Path) -> None:
     film = room.write_film(tmp_path / "film.mp4", shots, fps=5)
-    ended = prepare(film, "--out", tmp_path / "scene", "--mapping", "global", "--json")
+    ended = prepare(film, "--out", tmp_path / "scene", "--mapping", "incremental", "--json")
     assert ended.returncode == 0, ended.stderr
     told = json.loads(ended.stdout)
     assert told["duration"] == pytest.approx((FRAMES - 1) / 5)

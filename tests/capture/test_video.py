@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -76,3 +77,47 @@ def test_several_clips_follow_one_another(film: Path, tmp_path: Path) -> None:
     times = [frame.time for frame in frames.taken]
     assert times == pytest.approx([i / 12.5 for i in range(60)], abs=2e-3)
     assert frames.size == (96, 64) and frames.duration == pytest.approx(59 / 12.5, abs=2e-3)
+
+
+def patched(data: bytes, path: tuple[bytes, ...], change: Callable[[bytes], bytes]) -> bytes:
+    """Return an .mp4 with the content of one box changed, and its and its parents' sizes."""
+    at = 0
+    while at < len(data):
+        size = int.from_bytes(data[at : at + 4], "big")
+        if data[at + 4 : at + 8] == path[0]:
+            content = data[at + 8 : at + size]
+            content = patched(content, path[1:], change) if path[1:] else change(content)
+            head = (len(content) + 8).to_bytes(4, "big") + path[0]
+            return data[:at] + head + content + data[at + size :]
+        at += size
+    raise KeyError(path[0])
+
+
+def test_a_variable_frame_rate_is_kept(film: Path, tmp_path: Path) -> None:
+    """The table of durations says: 10 frames as they were, 20 of a quarter of the length."""
+    table = b"moov", b"trak", b"mdia", b"minf", b"stbl", b"stts"
+
+    def hurry(content: bytes) -> bytes:
+        delta = int.from_bytes(content[12:16], "big")
+        numbers = (2, 10, delta, 20, delta // 4)
+        return content[:4] + b"".join(n.to_bytes(4, "big") for n in numbers)
+
+    (tmp_path / "a.mp4").write_bytes(patched(film.read_bytes(), table, hurry))
+    times = [time for time, _ in read_video(tmp_path / "a.mp4")]
+    expected = np.cumsum([0] + 10 * [1 / 12.5] + 19 * [1 / 50])
+    assert times == pytest.approx(expected.tolist(), abs=2e-3)
+
+
+def test_a_rotation_that_a_phone_has_noted_is_applied(film: Path, tmp_path: Path) -> None:
+    """The matrix of the track turns the picture by 90 degrees clockwise."""
+
+    def turn(content: bytes) -> bytes:
+        one = 1 << 16
+        matrix = (0, one, 0, -one, 0, 0, 64 * one, 0, 1 << 30)
+        numbers = b"".join(n.to_bytes(4, "big", signed=True) for n in matrix)
+        return content[:40] + numbers + content[76:]
+
+    (tmp_path / "a.mp4").write_bytes(patched(film.read_bytes(), (b"moov", b"trak", b"tkhd"), turn))
+    _, plain = next(read_video(film))
+    _, turned = next(read_video(tmp_path / "a.mp4"))
+    np.testing.assert_array_equal(turned, np.rot90(plain, -1))
