@@ -218,10 +218,18 @@ def test_scaled_splats_move_by_the_share(tiny_scene: Path) -> None:
 
 @pytest.mark.parametrize("gate", ["scale", "freeze", "sparse"])
 def test_a_gate_that_never_closes_changes_nothing(tiny_scene: Path, gate: str) -> None:
+    """To a hundredth of a step, which is as long as the rate: sums are in another order.
+
+    Where a gradient is all but cancelled, its rounding errors make up much of it, and Adam divides
+    by its size; a step that were scaled or left out would differ by 0.99 of it at least.
+    """
     open_gate = after(gated(tiny_scene, f"saliency.gate={gate}", "saliency.threshold=1e-12"), 25)
     none = after(gated(tiny_scene), 25)
+    rates = none._rates(1.0)
     for name, tensor in none.model.tensors().items():
-        torch.testing.assert_close(open_gate.model.tensors()[name], tensor, atol=1e-6, rtol=1e-5)
+        torch.testing.assert_close(
+            open_gate.model.tensors()[name], tensor, atol=0.01 * rates[name], rtol=1e-5
+        )
 
 
 def test_nothing_is_gated_before_its_time(tiny_scene: Path) -> None:
