@@ -28,14 +28,15 @@ def run_child(job: str, arguments: Mapping[str, Any], tell: Callable[[int, int],
 
     Args:
         job: name of the job.
-        arguments: what it takes, fit for JSON.
+        arguments: what it takes, fit for JSON; ``out`` is the folder that it writes.
         tell: called with how much is done, and of how much.
 
     Raises:
         DataError: the job says that the data cannot be used.
         GsdmsrError: the job has failed.
     """
-    line = [sys.executable, "-m", "gsdmsr_cli.capture.colmap", job, json.dumps(arguments)]
+    # the folder is named for lists of processes; arguments may be longer than a command line
+    line = [sys.executable, "-m", "gsdmsr_cli.capture.colmap", job, str(arguments["out"])]
     last = ""
     # in a session of its own: Ctrl-C is for us, who then end it
     with (
@@ -51,7 +52,9 @@ def run_child(job: str, arguments: Mapping[str, Any], tell: Callable[[int, int],
         ) as process,
     ):
         try:
-            assert process.stdout is not None
+            assert process.stdin is not None and process.stdout is not None
+            process.stdin.write(json.dumps(arguments) + "\n")
+            process.stdin.flush()
             for text in process.stdout:
                 match text.split():
                     case ["progress", done, total]:
@@ -81,11 +84,16 @@ def _failure(job: str, lines: list[str], code: int) -> GsdmsrError:
     return GsdmsrError(f"COLMAP has failed in its job {job}: {reason}")
 
 
-def end_with_parent() -> None:
-    """In a child: end as soon as the parent has, however it did, and so its end of our stdin."""
+def receive_arguments() -> dict[str, Any]:
+    """In a child: return what the job takes.
+
+    From now on the child ends as soon as the parent has, however it did, and so its end of stdin.
+    """
+    arguments: dict[str, Any] = json.loads(sys.stdin.readline())
 
     def wait() -> None:
         sys.stdin.read()
         os._exit(1)
 
     threading.Thread(target=wait, daemon=True).start()
+    return arguments

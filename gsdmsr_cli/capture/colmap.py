@@ -7,13 +7,12 @@ depend on their order, has one thread.
 
 from __future__ import annotations
 
-import json
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from gsdmsr_cli.capture.child import REFUSED, end_with_parent
+from gsdmsr_cli.capture.child import REFUSED, receive_arguments
 from gsdmsr_cli.capture.failure import why_no_model
 from gsdmsr_cli.capture.features import read_features
 from gsdmsr_cli.capture.masks import read_mask, standing
@@ -155,9 +154,8 @@ def _tell(done: int, total: int) -> None:
 
 
 def main() -> None:
-    """Do the job that the command line names, with the arguments that follow as JSON."""
-    end_with_parent()
-    job, arguments = sys.argv[1], json.loads(sys.argv[2])
+    """Do the job that the command line names, with the arguments that come by stdin."""
+    job, arguments = sys.argv[1], receive_arguments()
     jobs: dict[str, Callable[..., None]] = {"match": match, "map": map_frames}
     try:
         jobs[job](**arguments)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from itertools import combinations
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -11,12 +12,14 @@ import room
 from hypothesis import given
 from hypothesis import strategies as st
 
+from gsdmsr_cli.capture.child import run_child
 from gsdmsr_cli.capture.consistency import essential_matrix, rays_of, sampson_distance
 from gsdmsr_cli.capture.features import find_features
 from gsdmsr_cli.capture.options import CAMERA_MODELS, MATCHINGS
 from gsdmsr_cli.capture.pairs import NEIGHBOURS, choose_pairs
 from gsdmsr_cli.capture.reconstruction import lens_of
 from gsdmsr_cli.capture.settle import is_test, upright
+from gsdmsr_cli.errors import GsdmsrError
 from gsdmsr_cli.native import load_pycolmap
 
 PARAMS = {
@@ -97,3 +100,11 @@ def test_up_becomes_the_z_axis() -> None:
 def test_every_eighth_view_is_for_testing_and_neither_end() -> None:
     assert [i for i in range(40) if is_test(i, 8)] == [4, 12, 20, 28, 36]
     assert not any(is_test(i, 0) for i in range(40))
+
+
+def test_a_job_may_have_more_arguments_than_fit_a_command_line(tmp_path: Path) -> None:
+    pairs = choose_pairs(300, "exhaustive", False)
+    nothing = {"pictures": str(tmp_path / "none"), "names": [], "features": "", "masks": None}
+    rest = {"camera_model": "PINHOLE", "focal": None, "pairs": pairs, "seed": 0}
+    with pytest.raises(GsdmsrError, match="COLMAP has failed in its job match"):
+        run_child("match", {"out": str(tmp_path), **nothing, **rest}, lambda done, total: None)
