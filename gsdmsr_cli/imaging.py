@@ -1,4 +1,4 @@
-"""Pictures and video on disk; the one module that imports cv2 and OpenImageIO."""
+"""Pictures and video on disk, and what is done to pixels."""
 
 from __future__ import annotations
 
@@ -11,15 +11,12 @@ from collections.abc import Iterable, Iterator
 from itertools import chain
 from pathlib import Path
 
-# cv2 comes first: pycolmap exports zlib and png symbols of its own, and loading it before cv2 makes
-# every later PNG write abort the process. Whoever needs pycolmap imports this module before it.
-import cv2
 import numpy as np
-import OpenImageIO
 from numpy.typing import NDArray
 
 from gsdmsr_cli.errors import DataError, GsdmsrError
 from gsdmsr_cli.files import replacing
+from gsdmsr_cli.native import OpenImageIO, cv2
 
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _PNG_SETTINGS = (

@@ -85,6 +85,12 @@ def test_kernels_know_nothing_of_torch() -> None:
             assert not {name.split(".")[0] for name in imported} & {"torch"}, module
 
 
+def test_one_module_keeps_the_order_in_which_native_libraries_are_imported() -> None:
+    ordered = {"cv2", "OpenImageIO", "pycolmap"}
+    importing = {module for module, imported in MODULES.items() if imported & ordered}
+    assert importing == {"gsdmsr_cli.native"}
+
+
 def test_the_command_line_imports_commands_only_when_they_run() -> None:
     tree = ast.parse((PACKAGE / "cli.py").read_text(encoding="utf-8"))
     top = [node for node in tree.body if isinstance(node, ast.Import | ast.ImportFrom)]

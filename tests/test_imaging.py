@@ -350,8 +350,10 @@ def test_pngs_can_be_written_after_pycolmap_is_imported(tmp_path: Path) -> None:
     pytest.importorskip("pycolmap")
     program = f"""
 from pathlib import Path
+from gsdmsr_cli.native import load_pycolmap
+load_pycolmap()
 from gsdmsr_cli import imaging
-import numpy as np, pycolmap
+import numpy as np
 path = Path({str(tmp_path / "a.png")!r})
 imaging.write_png(path, np.zeros((64, 64, 4), np.uint8))
 assert imaging.read_image(path).shape == (64, 64, 4)

@@ -1,6 +1,6 @@
 """Scale-invariant features of every frame (Lowe 2004), by OpenCV, as COLMAP wants them.
 
-OpenCV's SIFT takes about a fifth of the time of the one within COLMAP on a CPU. Descriptors are
+OpenCV's SIFT is faster on a CPU than the one within COLMAP. Descriptors are
 normalised to RootSIFT (Arandjelovic & Zisserman 2012), which COLMAP's matcher expects.
 """
 
