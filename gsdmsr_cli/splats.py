@@ -50,6 +50,10 @@ class Splats:
         """Degree of the stored spherical harmonics."""
         return int(self.sh.shape[1] ** 0.5) - 1
 
+    def degree_up_to(self, limit: int | None) -> int:
+        """Return the degree that is drawn: what is stored, or ``limit`` if that is less."""
+        return self.sh_degree if limit is None else min(limit, self.sh_degree)
+
     def tensors(self) -> dict[str, Tensor]:
         """Return the five tensors by name, in the order of the attributes."""
         return {name: getattr(self, name) for name in NAMES}

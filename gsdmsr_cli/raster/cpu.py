@@ -34,7 +34,7 @@ def rasterize(
     with_depth: bool = False,
 ) -> Frame:
     """Draw float32 splats; see ``gsdmsr_cli.raster``."""
-    degree = splats.sh_degree if sh_degree is None else min(sh_degree, splats.sh_degree)
+    degree = splats.degree_up_to(sh_degree)
     tensors = [tensor.contiguous() for tensor in splats.tensors().values()]
     means2d, conics, depths, opacities, colours, radii, tiles = _Project.apply(
         camera, degree, *tensors
@@ -65,7 +65,7 @@ def compare(
     """Draw float32 splats and compare, in one call; see ``gsdmsr_cli.raster``."""
     if tile_weights is not None and ssim_weight > 0:
         raise ValueError("tiles cannot be weighted where SSIM counts, whose windows overlap them")
-    degree = splats.sh_degree if sh_degree is None else min(sh_degree, splats.sh_degree)
+    degree = splats.degree_up_to(sh_degree)
     tensors = [tensor.contiguous() for tensor in splats.tensors().values()]
     weights = torch.empty(0) if tile_weights is None else tile_weights.contiguous()
     loss, on_screen, errors = _Look.apply(

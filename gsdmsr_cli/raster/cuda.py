@@ -131,8 +131,7 @@ def _stored(splats: Splats) -> list[Tensor]:
 
 def _terms(splats: Splats, sh_degree: int | None) -> int:
     """Return how many coefficients of colour are used."""
-    degree = splats.sh_degree if sh_degree is None else min(sh_degree, splats.sh_degree)
-    return (degree + 1) ** 2
+    return (splats.degree_up_to(sh_degree) + 1) ** 2
 
 
 def _to(background: Tensor, like: Tensor) -> Tensor:

@@ -61,7 +61,7 @@ def rasterize(
         sh_degree: highest degree of the harmonics used, all that are stored by default.
         with_depth: whether to blend camera z too.
     """
-    degree = splats.sh_degree if sh_degree is None else min(sh_degree, splats.sh_degree)
+    degree = splats.degree_up_to(sh_degree)
     rows, radii = _drawn(splats, camera)
     drawn = splats.take(rows)
     projected = project(drawn, camera)
