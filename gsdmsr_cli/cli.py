@@ -317,9 +317,7 @@ def render(
     output: Annotated[
         str, typer.Option(metavar="A,B", help="Any of rgb, depth, alpha, flow, error.")
     ] = "rgb",
-    video: Annotated[
-        str, typer.Option(metavar="A,B", help="webm, mp4 (needs ffmpeg), or none.")
-    ] = "webm",
+    video: Annotated[str, typer.Option(metavar="A,B", help="webm, mp4, or none.")] = "webm",
     size: Annotated[
         str | None, typer.Option(metavar="WxH", help="Size of the pictures [px].")
     ] = None,

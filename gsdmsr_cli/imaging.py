@@ -1,14 +1,10 @@
-"""Pictures and video on disk, and what is done to pixels."""
+"""Pictures on disk, and what is done to pixels."""
 
 from __future__ import annotations
 
-import contextlib
 import os
 import struct
-import threading
 import zlib
-from collections.abc import Iterable, Iterator
-from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -205,32 +201,6 @@ def resample(
     return np.asarray(taken, dtype=np.float32)
 
 
-def write_webm(path: Path, frames: Iterable[NDArray[np.uint8]], fps: float) -> None:
-    """Write (H, W, 3) RGB frames as a VP8 video that browsers play, whole or not at all.
-
-    VP8 needs even sizes; an odd last row or column is doubled.
-
-    Raises:
-        GsdmsrError: there are no frames, or OpenCV has no VP8 encoder.
-        DataError: the file cannot be written, for example because the disk is full.
-        ValueError: the frames differ in size.
-    """
-    frames = iter(frames)
-    first = next(frames, None)
-    if first is None:
-        raise GsdmsrError(f"{path}: a video needs at least one frame")
-    with replacing(path) as temporary:
-        temporary.touch()  # The encoder does not say why it cannot open a file; this does.
-        written = _encode(temporary, chain([first], frames), first.shape, fps)
-        # OpenCV drops what it could not write without a word, so count what is really there.
-        if _count_frames(temporary) != written:
-            height, width, _ = first.shape
-            raise DataError(
-                f"cannot write {path}: the file is incomplete; is the disk full? "
-                f"Or are {width} x {height} px too few for VP8?"
-            )
-
-
 def _open(path: Path, thorough: bool = False) -> OpenImageIO.ImageInput:
     try:
         if not path.is_file():
@@ -276,63 +246,3 @@ def _png_fault(path: Path, thorough: bool) -> str | None:
 def _unreadable(path: Path, message: str) -> str:
     reason = " ".join(message.split()) or "not a picture"
     return f"image {path} is damaged or not a picture ({reason}); restore the file"
-
-
-def _encode(
-    path: Path, frames: Iterable[NDArray[np.uint8]], shape: tuple[int, ...], fps: float
-) -> int:
-    """Write the frames to ``path`` and return how many there were."""
-    height, width, _ = shape
-    pad = ((0, height % 2), (0, width % 2), (0, 0))
-    codec = cv2.VideoWriter.fourcc(*"VP80")
-    size = (width + width % 2, height + height % 2)
-    with _silent_stderr():
-        writer = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, codec, float(fps), size)
-    if not writer.isOpened():
-        raise GsdmsrError(
-            f"OpenCV cannot encode VP8 at {size[0]} x {size[1]}, {fps} frames/s; write PNG frames"
-        )
-    written = 0
-    try:
-        for frame in frames:
-            if frame.shape != shape:
-                raise ValueError(f"frame {written} has shape {frame.shape}, not {shape}")
-            even = np.pad(frame, pad, mode="edge") if height % 2 or width % 2 else frame
-            writer.write(cv2.cvtColor(even, cv2.COLOR_RGB2BGR))
-            written += 1
-    finally:
-        writer.release()
-    return written
-
-
-def _count_frames(path: Path) -> int:
-    count = 0
-    with _silent_stderr():  # FFmpeg tells of a file that is cut short
-        # of packets as they are, which is a hundred times as fast as decoding them
-        capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG, (cv2.CAP_PROP_FORMAT, -1))
-        while capture.grab():
-            count += 1
-        capture.release()
-    return count
-
-
-_stderr = threading.Lock()
-"""Videos may be written from several threads, but the process has only one stderr."""
-
-
-@contextlib.contextmanager
-def _silent_stderr() -> Iterator[None]:
-    """Drop what C code prints: OpenCV tells every time, and wrongly, that .webm has no VP80 tag."""
-    with _stderr:
-        try:
-            saved = os.dup(2)
-        except OSError:  # The process has no stderr, so there is nothing to silence.
-            yield
-            return
-        try:
-            with Path(os.devnull).open("w") as nowhere:
-                os.dup2(nowhere.fileno(), 2)
-            yield
-        finally:
-            os.dup2(saved, 2)
-            os.close(saved)

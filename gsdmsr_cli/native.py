@@ -1,7 +1,7 @@
-"""OpenCV, OpenImageIO and pycolmap, imported in the one order in which they get along.
+"""OpenCV, OpenImageIO, pycolmap and PyAV, imported in the one order in which they get along.
 
 pycolmap exports zlib and png symbols of its own, and loading it before cv2 makes every later PNG
-write abort the process. So whoever needs one of the three takes it from here.
+write abort the process. So whoever needs one of them takes it from here.
 """
 
 from __future__ import annotations
@@ -18,3 +18,10 @@ def load_pycolmap() -> Any:
 
     pycolmap.logging.minloglevel = pycolmap.logging.ERROR.value
     return pycolmap
+
+
+def load_av() -> Any:
+    """Return PyAV, whose libraries are loaded only for those who write videos."""
+    import av
+
+    return av

@@ -86,7 +86,7 @@ def test_kernels_know_nothing_of_torch() -> None:
 
 
 def test_one_module_keeps_the_order_in_which_native_libraries_are_imported() -> None:
-    ordered = {"cv2", "OpenImageIO", "pycolmap"}
+    ordered = {"cv2", "OpenImageIO", "pycolmap", "av"}
     importing = {module for module, imported in MODULES.items() if imported & ordered}
     assert importing == {"gsdmsr_cli.native"}
 

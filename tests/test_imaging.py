@@ -13,7 +13,7 @@ import pytest
 from datasets import noise, write_picture
 
 from gsdmsr_cli import imaging
-from gsdmsr_cli.errors import DataError, GsdmsrError
+from gsdmsr_cli.errors import DataError
 
 
 def assert_one_line(error: pytest.ExceptionInfo[DataError], path: Path) -> None:
@@ -160,8 +160,6 @@ def test_a_missing_folder_is_named(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="No such file or directory") as error:
         imaging.write_png(path, noise(2, 2, 3))
     assert_one_line(error, path)
-    with pytest.raises(DataError, match="No such file or directory"):
-        imaging.write_webm(path.with_suffix(".webm"), [noise(2, 2, 3)], 24)
 
 
 def test_composite_is_straight_alpha_in_float() -> None:
@@ -281,69 +279,6 @@ def test_the_colour_wheel_turns_clockwise_from_red(
 ) -> None:
     found = imaging.colour_wheel(np.array([[vector]], np.float32))
     assert np.abs(found[0, 0].astype(int) - colour).max() <= 1
-
-
-def read_video(path: Path) -> list[np.ndarray]:
-    capture = cv2.VideoCapture(str(path))
-    frames = []
-    while (frame := capture.read()[1]) is not None:
-        frames.append(frame[..., ::-1])
-    return frames
-
-
-@pytest.mark.parametrize(("height", "width"), [(32, 48), (33, 47), (9, 7)])
-def test_webm_holds_every_frame_with_even_sides(
-    tmp_path: Path, height: int, width: int, capfd: pytest.CaptureFixture[str]
-) -> None:
-    colours = [(220, 30, 30), (30, 220, 30), (30, 30, 220)]
-    frames = (np.full((height, width, 3), colour, np.uint8) for colour in colours)
-    imaging.write_webm(tmp_path / "a.webm", frames, 12)
-    read = read_video(tmp_path / "a.webm")
-    assert len(read) == 3
-    for frame, colour in zip(read, colours, strict=True):
-        assert frame.shape == (height + height % 2, width + width % 2, 3)
-        assert np.abs(frame.astype(int) - colour).max() < 40
-    assert [path.name for path in tmp_path.iterdir()] == ["a.webm"]
-    assert capfd.readouterr().err == ""
-
-
-def test_webm_needs_frames_of_one_size(tmp_path: Path) -> None:
-    with pytest.raises(GsdmsrError, match="at least one frame"):
-        imaging.write_webm(tmp_path / "a.webm", [], 24)
-    with pytest.raises(ValueError, match="frame 1 has shape"):
-        imaging.write_webm(tmp_path / "a.webm", [noise(4, 4, 3), noise(4, 6, 3)], 24)
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_webm_says_when_the_encoder_does_not_open(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(cv2.VideoWriter, "fourcc", staticmethod(lambda *_: 0))
-    with pytest.raises(GsdmsrError, match="cannot encode VP8"):
-        imaging.write_webm(tmp_path / "a.webm", [noise(4, 4, 3)], 24)
-    assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.skipif(sys.platform == "win32", reason="needs a limit on the size of files")
-def test_webm_that_does_not_fit_on_the_disk_is_refused(tmp_path: Path) -> None:
-    program = f"""
-import resource, signal
-from pathlib import Path
-import numpy as np
-from gsdmsr_cli import imaging
-from gsdmsr_cli.errors import DataError
-signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-resource.setrlimit(resource.RLIMIT_FSIZE, (20000, 20000))
-rng = np.random.default_rng(0)
-frames = (rng.integers(0, 256, (48, 64, 3), dtype=np.uint8) for _ in range(40))
-try:
-    imaging.write_webm(Path({str(tmp_path / "a.webm")!r}), frames, 24)
-except DataError as error:
-    print(error)
-"""
-    run = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
-    assert "is the disk full?" in run.stdout, run.stderr
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_pngs_can_be_written_after_pycolmap_is_imported(tmp_path: Path) -> None:

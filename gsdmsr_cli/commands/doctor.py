@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import platform
-import shutil
 from importlib import metadata
 from typing import Any
 
@@ -19,6 +18,8 @@ from gsdmsr_cli.cuda import availability
 from gsdmsr_cli.errors import GsdmsrError
 from gsdmsr_cli.evaluation.lpips import NETS, load_lpips
 from gsdmsr_cli.evaluation.metrics import Missing
+from gsdmsr_cli.filming.encode import require_encoder
+from gsdmsr_cli.filming.request import VIDEOS
 
 _PACKAGES = (
     "torch",
@@ -28,6 +29,7 @@ _PACKAGES = (
     "opencv-contrib-python-headless",
     "OpenImageIO",
     "pycolmap",
+    "av",
     "safetensors",
     "PyYAML",
     "typer",
@@ -61,7 +63,7 @@ def examine() -> dict[str, Any]:
             kind: plugins.names(f"gsdmsr_cli.{kind}") for kind in ("motion", "formats", "exports")
         },
         "presets": preset_files.preset_names(),
-        "ffmpeg": shutil.which("ffmpeg"),
+        "videos": {kind: _video(kind) for kind in VIDEOS},
     }
 
 
@@ -102,6 +104,15 @@ def _lpips(net: str) -> str | None:
     return found.reason if isinstance(found, Missing) else None
 
 
+def _video(kind: str) -> str | None:
+    """Return why videos of this kind cannot be written, or None where they can."""
+    try:
+        require_encoder(kind)
+    except (GsdmsrError, ImportError) as error:
+        return str(error)
+    return None
+
+
 def _table(report: dict[str, Any]) -> Table:
     table = Table("what", "found", title=f"gsdmsr {report['gsdmsr']}")
     cpu = report["cpu"]
@@ -120,7 +131,8 @@ def _table(report: dict[str, Any]) -> Table:
     for kind, names in report["plugins"].items():
         table.add_row(kind, ", ".join(names) or "none")
     table.add_row("presets", ", ".join(report["presets"]))
-    table.add_row("ffmpeg", report["ffmpeg"] or "not on the path; OpenCV's own is used")
+    for kind, reason in report["videos"].items():
+        table.add_row(f"video {kind}", _verdict(reason))
     return table
 
 

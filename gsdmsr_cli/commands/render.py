@@ -9,7 +9,7 @@ from rich.console import Console
 from gsdmsr_cli.commands._progress import progress_bar
 from gsdmsr_cli.commands._trained import Trained, open_trained
 from gsdmsr_cli.film import Film, PathOptions
-from gsdmsr_cli.filming.mp4 import require_ffmpeg
+from gsdmsr_cli.filming.encode import require_encoder
 from gsdmsr_cli.filming.outputs import Ends, find_ends
 from gsdmsr_cli.filming.record import Reel, file_hash, shots_hash
 from gsdmsr_cli.filming.request import Request
@@ -34,8 +34,8 @@ def run(run_folder: Path, request: Request, out: Path | None, data: Path | None 
         UsageError: a path, view or output that does not exist, or does not go with another wish.
         DataError: the run or its data cannot be used, or a file not be written.
     """
-    if "mp4" in request.videos:
-        require_ffmpeg()
+    for kind in request.videos:
+        require_encoder(kind)
     trained = open_trained(run_folder, data)
     films = [_film(trained, path, request) for path in ([request.path] if request.path else USUAL)]
     target, tools = out or run_folder / "render", _tools(trained, request)

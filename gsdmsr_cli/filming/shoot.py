@@ -14,17 +14,15 @@ from numpy.typing import NDArray
 
 from gsdmsr_cli.evaluation.protocol import Studio
 from gsdmsr_cli.film import Film, Shot
-from gsdmsr_cli.filming.crew import Crew, Video, WriteVideo
+from gsdmsr_cli.filming.crew import Crew, Video
+from gsdmsr_cli.filming.encode import write_video
 from gsdmsr_cli.filming.layers import Artist, Floats, Layers
-from gsdmsr_cli.filming.mp4 import write_mp4
 from gsdmsr_cli.filming.outputs import CHANNELS, Ends, numbers, picture
 from gsdmsr_cli.filming.record import Reel
-from gsdmsr_cli.imaging import read_image, resize_area, write_exr, write_png, write_webm
+from gsdmsr_cli.imaging import read_image, resize_area, write_exr, write_png
 
 Pixels = NDArray[np.uint8]
 Pictures = Mapping[str, Pixels]
-
-WRITERS: dict[str, WriteVideo] = {"webm": write_webm, "mp4": write_mp4}
 
 ROOM_BYTES, MOST_ROOM = 512 << 20, 16
 """Memory for frames that wait to be written, and most such frames."""
@@ -157,7 +155,7 @@ def _videos(crew: Crew, reel: Reel, kinds: Sequence[str]) -> list[Video]:
     """Begin the videos of a reel that are not there yet."""
     paths = {kind: reel.video(kind) for kind in kinds}
     return [
-        crew.video(path, WRITERS[kind], reel.fps)
+        crew.video(path, partial(write_video, kind), reel.fps)
         for kind, path in paths.items()
         if not path.exists()
     ]

@@ -22,6 +22,7 @@ from gsdmsr_cli.filming import layers as drawn_layers
 from gsdmsr_cli.filming import shoot
 from gsdmsr_cli.formats import read_scene
 from gsdmsr_cli.imaging import image_size, read_exr, read_image
+from gsdmsr_cli.native import load_av
 from gsdmsr_cli.pictures import Pictures
 from gsdmsr_cli.preset import load_preset
 from gsdmsr_cli.raster import best_engine
@@ -259,7 +260,7 @@ BAD = {
     "too small": ("--path orbit --scale 0.001", 2, "pictures of 0 x 0 px"),
     "no file of keyframes": ("--path none.json", 3, r"none\.json: cannot be read: No such file"),
     "no view": ("--path still --view test/r_9", 2, "no view is called 'test/r_9'"),
-    "no ffmpeg": ("--path orbit --video mp4", 2, "needs the program ffmpeg"),
+    "no encoder": ("--path orbit --video mp4", 2, "needs the encoder libx264"),
 }
 
 
@@ -273,7 +274,7 @@ def test_what_cannot_be_drawn_is_told_before_anything_is_written(
     code: int,
     message: str,
 ) -> None:
-    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.setattr(load_av(), "codecs_available", {"libvpx"})
     assert render(line) == code
     assert re.search(message, one_line(capsys))
     assert not (tmp_path / "out").exists()

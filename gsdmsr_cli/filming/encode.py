@@ -1,0 +1,129 @@
+"""Videos for looking at: VP8 in WebM and H.264 in MP4, by the encoders that PyAV brings."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from fractions import Fraction
+from itertools import chain
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gsdmsr_cli.errors import GsdmsrError, UsageError
+from gsdmsr_cli.files import replacing
+from gsdmsr_cli.native import load_av
+
+Pixels = NDArray[np.uint8]
+
+
+@dataclass(frozen=True)
+class Encoding:
+    """What a kind of video is made with.
+
+    Attributes:
+        encoder: FFmpeg's name of it.
+        options: of the encoder.
+        muxing: options of the container.
+        most_bits: limit of the rate [bit/s], or None for none.
+        matrix: PyAV's name of what makes YUV of RGB.
+    """
+
+    encoder: str
+    options: Mapping[str, str]
+    muxing: Mapping[str, str] = field(default_factory=dict)
+    most_bits: int | None = None
+    matrix: str = "ITU601"
+
+
+ENCODINGS = {
+    # VP8 aims at a quality only below a limit of the rate; of colours it knows one kind
+    "webm": Encoding(
+        "libvpx", {"crf": "8", "deadline": "good", "cpu-used": "5"}, most_bits=40_000_000
+    ),
+    # players take HD for BT.709 and anything else for BT.601 unless the file says which it is
+    "mp4": Encoding(
+        "libx264",
+        {
+            "crf": "18", "preset": "veryfast",
+            "colorspace": "bt709", "color_primaries": "bt709", "color_trc": "bt709",
+        },
+        muxing={"movflags": "+faststart"},
+        matrix="ITU709",
+    ),
+}  # fmt: skip
+"""By the kind of video, which is also FFmpeg's name of the container."""
+
+
+def require_encoder(kind: str) -> None:
+    """Make sure that videos of a kind can be written.
+
+    Raises:
+        UsageError: the PyAV that is installed has no encoder for it.
+    """
+    encoder = ENCODINGS[kind].encoder
+    if encoder not in load_av().codecs_available:
+        raise UsageError(
+            f"--video {kind} needs the encoder {encoder}, which the installed PyAV lacks; its "
+            "wheels have it: pip install --force-reinstall --only-binary :all: av"
+        )
+
+
+def write_video(kind: str, path: Path, frames: Iterable[Pixels], fps: float) -> None:
+    """Write (H, W, 3) RGB frames as a video of a kind of ``ENCODINGS``, whole or not at all.
+
+    Colours are kept at half the resolution, which needs even sizes: an odd last row or column is
+    doubled.
+
+    Raises:
+        UsageError: the PyAV that is installed has no encoder for it.
+        GsdmsrError: there are no frames, or the encoder refuses them.
+        DataError: the file cannot be written, for example because the disk is full.
+        ValueError: the frames differ in size.
+    """
+    require_encoder(kind)
+    frames = iter(frames)
+    first = next(frames, None)
+    if first is None:
+        raise GsdmsrError(f"{path}: a video needs at least one frame")
+    encoding, av = ENCODINGS[kind], load_av()
+    with replacing(path) as beside:
+        try:
+            with av.open(str(beside), "w", format=kind, options=dict(encoding.muxing)) as container:
+                _encode(container, encoding, chain([first], frames), first.shape, fps)
+        except av.FFmpegError as error:
+            if isinstance(error, OSError):
+                raise
+            height, width, _ = first.shape
+            raise GsdmsrError(
+                f"{path}: {encoding.encoder} cannot encode {width} x {height} px at {fps:g} "
+                f"frames/s: {error.strerror}; change --size or --fps, or take --video none"
+            ) from error
+
+
+def _encode(
+    container: Any,
+    encoding: Encoding,
+    frames: Iterable[Pixels],
+    shape: tuple[int, ...],
+    fps: float,
+) -> None:
+    frame_of = load_av().VideoFrame.from_ndarray
+    height, width, _ = shape
+    odd = (0, height % 2), (0, width % 2), (0, 0)
+    rate = Fraction(fps).limit_denominator(1001)
+    stream = container.add_stream(encoding.encoder, rate, options=dict(encoding.options))
+    stream.width, stream.height = width + width % 2, height + height % 2
+    stream.pix_fmt = "yuv420p"
+    if encoding.most_bits is not None:
+        stream.bit_rate = encoding.most_bits
+    for i, frame in enumerate(frames):
+        if frame.shape != shape:
+            raise ValueError(f"frame {i} has shape {frame.shape}, not {shape}")
+        even = np.pad(frame, odd, mode="edge") if height % 2 or width % 2 else frame
+        given = frame_of(np.ascontiguousarray(even), format="rgb24")
+        yuv = given.reformat(format="yuv420p", dst_colorspace=encoding.matrix)
+        container.mux(stream.encode(yuv))
+    container.mux(stream.encode())
