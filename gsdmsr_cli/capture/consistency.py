@@ -1,4 +1,4 @@
-"""Which share of what was matched moves, as far as the cameras tell."""
+"""What matches say about the cameras: what of them moves, and which a mere turn explains."""
 
 from __future__ import annotations
 
@@ -32,6 +32,9 @@ ALIKE = 0.25
 WIDEST = 5.0
 """No ray is farther than this from the axis, at depth 1: polynomials of lenses explode there."""
 
+FOCALS = np.geomspace(0.35, 2.3, 24)
+"""Focal lengths that a turning camera is tried with, in units of the longer side."""
+
 _STEPS = 20
 
 
@@ -62,6 +65,59 @@ def moving_share(matches: Path, found: Reconstruction) -> float:
             shifts = pixels[second][pairs[:, 1]] - pixels[first][pairs[:, 0]]
             off += int(coherent(pixels[first][pairs[:, 0]], shifts, distances > limit).sum())
     return off / max(total, 1)
+
+
+def turning_share(matches: Path, lens: Lens) -> float:
+    """Return the share of verified matches that a camera explains that only turns on its spot.
+
+    Pixels then move by K R K^-1, whatever the depths (Hartley & Zisserman, Multiple View Geometry,
+    8.4.2). From such pictures cameras can be made up that fit to a fraction of a pixel; so their
+    focal length counts for nothing here, and the one that suits a turn best is taken.
+
+    Args:
+        matches: folder of the database.
+        lens: its size and principal point.
+    """
+    pairs = _farthest_matches(matches)
+    total = sum(len(one) for one, _ in pairs)
+    centre, side = np.array([lens.cx, lens.cy]), max(lens.width, lens.height)
+    limit = max(OFF * side, LEAST_OFF)
+    best = 0
+    for focal in side * FOCALS:
+        explained = 0
+        for pixels in pairs:
+            one, other = (np.c_[(p - centre) / focal, np.ones(len(p))] for p in pixels)
+            turned = one @ _turn(one, other).T
+            ahead = turned[:, 2] > 0
+            shown = turned[ahead, :2] / turned[ahead, 2:]
+            distances = focal * np.linalg.norm(shown - other[ahead, :2], axis=1)
+            explained += int((distances < limit).sum())
+        best = max(best, explained)
+    return best / max(total, 1)
+
+
+def _farthest_matches(matches: Path) -> list[tuple[Floats, Floats]]:
+    """Return the (N, 2) pixels that each frame shares with the farthest one it matches."""
+    found = []
+    with load_pycolmap().Database.open(matches / DATABASE) as database:
+        images = sorted(database.read_all_images(), key=lambda image: image.name)
+        ids = [image.image_id for image in images]
+        pixels = {i: database.read_keypoints(i)[:, :2].astype(np.float64) for i in ids}
+        for k, first in enumerate(ids):
+            for second in reversed(ids[k + 1 :]):
+                if database.exists_two_view_geometry(first, second):
+                    inliers = database.read_two_view_geometry(first, second).inlier_matches
+                    if len(inliers):
+                        found.append((pixels[first][inliers[:, 0]], pixels[second][inliers[:, 1]]))
+                        break
+    return found
+
+
+def _turn(one: Floats, other: Floats) -> Floats:
+    """Return the rotation that takes (N, 3) directions to others best (Kabsch 1976)."""
+    one, other = (rays / np.linalg.norm(rays, axis=1, keepdims=True) for rays in (one, other))
+    u, _, vt = np.linalg.svd(other.T @ one)
+    return np.asarray(u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt, dtype=np.float64)
 
 
 def coherent(

@@ -13,7 +13,7 @@ import numpy as np
 
 from gsdmsr_cli.capture import write
 from gsdmsr_cli.capture.child import run_child
-from gsdmsr_cli.capture.consistency import moving_share
+from gsdmsr_cli.capture.consistency import moving_share, turning_share
 from gsdmsr_cli.capture.convert import write_converted
 from gsdmsr_cli.capture.features import write_features
 from gsdmsr_cli.capture.frames import Frames, read_frames, write_frames
@@ -68,7 +68,8 @@ def prepare(
         moving, masked_by = work.find_masks(frames, first), "found"
     matches, found = work.find_cameras(frames, features, moving)
     require_registered(frames, found, options.min_registered)
-    quality = assess(frames, found, moving_share(matches, found), masked_by, moving)
+    shares = moving_share(matches, found), turning_share(matches, found.lens)
+    quality = assess(frames, found, *shares, masked_by, moving)
     provenance = {
         "input": {"name": source.root.name, "kind": source.kind, "sha256": work.key["source"]},
         "masks": masked_by,

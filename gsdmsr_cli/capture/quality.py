@@ -36,9 +36,17 @@ DISTORTION = 0.03
 MOVING = 0.1
 """Share of the matches that agree with no standing point beyond which something large moves."""
 
+TURNING = 0.8
+"""Share of the matches that a mere turn explains beyond which cameras may be made up."""
+
 
 def assess(
-    frames: Frames, found: Reconstruction, moving: float, masked_by: str, masks: Path | None
+    frames: Frames,
+    found: Reconstruction,
+    moving: float,
+    turning: float,
+    masked_by: str,
+    masks: Path | None,
 ) -> dict[str, Any]:
     """Return the report, fit for JSON.
 
@@ -46,6 +54,7 @@ def assess(
         frames: all that were chosen.
         found: what became of them.
         moving: share of matches that disagree with the cameras.
+        turning: share of matches that a camera explains that only turns.
         masked_by: where masks come from: "given", "found" or "nothing".
         masks: folder of the frames' masks.
     """
@@ -74,6 +83,7 @@ def assess(
         "parallax_deg": float(np.median(parallax)) if len(parallax) else 0.0,
         "path_over_depth": _path_over_depth(found),
         "moving_matches": moving,
+        "turning_matches": turning,
         "masks": _mask_report(frames, masked_by, masks),
     }
     report["warnings"] = warnings(report)
@@ -166,6 +176,12 @@ def warnings(report: Mapping[str, Any]) -> list[str]:
             f"{100 * report['moving_matches']:.0f} % of what was found in two frames moves, as far "
             "as the cameras tell: something large does, or the cameras are wrong; give --masks of "
             "it, or try --auto-mask"
+        )
+    if report["turning_matches"] > TURNING:
+        found.append(
+            f"a camera that only turns explains {100 * report['turning_matches']:.0f} % of what "
+            "was found in two frames: depth, path and focal length may be made up, however small "
+            "the errors are; film again while walking round the scene"
         )
     if report["corner_distortion_px"] > DISTORTION * report["diagonal_px"]:
         found.append(

@@ -51,6 +51,7 @@ def rows(quality: Mapping[str, Any]) -> list[tuple[str, str]]:
             f"{quality['path_over_depth']:.2f} times as long as the scene is deep",
         ),
         ("matches that move", f"{100 * quality['moving_matches']:.0f} %"),
+        ("matches that a turn explains", f"{100 * quality['turning_matches']:.0f} %"),
     ]
     masks = quality["masks"]
     if masks["from"] != "nothing":

@@ -89,6 +89,7 @@ def test_the_report_says_how_good_the_cameras_are(scene: Path) -> None:
     assert quality["frames"]["registered"] == FRAMES and not quality["frames"]["dropped"]
     assert quality["reprojection_px"] < 0.5 and quality["parallax_deg"] > 15
     assert quality["moving_matches"] < 0.05 and quality["warnings"] == []
+    assert quality["turning_matches"] < 0.3
     page = (scene / "report.html").read_text()
     assert page.count("<svg") == 2 and "prefers-color-scheme:dark" in page
 
@@ -196,6 +197,19 @@ def test_a_full_disk_is_told_and_leaves_no_scene(
     assert "disk full?" in ended.stderr or "free space" in ended.stderr
     assert ended.stderr.count("\n") == 1 and not (tmp_path / "scene").exists()
     assert not list((tmp_path / "scene.stages").glob(".*"))
+
+
+def test_a_camera_that_only_turns_is_told_of(tmp_path: Path) -> None:
+    """Its cameras are made up and fit to a tenth of a pixel."""
+    place = np.array([0.0, -1.2, 0.1])
+    ahead = [[np.sin(angle), np.cos(angle), -0.1] for angle in np.linspace(-0.8, 0.8, FRAMES)]
+    shots = room.film(np.stack([room.look_at(place, place + d) for d in ahead]))
+    pictures = room.write_pictures(tmp_path / "pictures", shots)
+    ended = prepare(pictures, "--out", tmp_path / "scene")
+    assert ended.returncode == 0, ended.stderr
+    quality = json.loads((tmp_path / "scene" / "scene.json").read_text())["quality"]
+    assert quality["turning_matches"] > 0.99 and quality["reprojection_px"] < 0.2
+    assert any("only turns" in warning for warning in quality["warnings"])
 
 
 def noisy(pictures: np.ndarray) -> room.Shots:
