@@ -76,6 +76,7 @@ class HexPlaneMotion:
         if self._own is None:
             return self.layers
         *layers, last = self.layers
+        self._own = self._own.to(last.weight.device)  # where the model has gone meanwhile
         return [*layers, network.Layer(last.weight * self._own, last.bias)]
 
     def take(self, rows: Tensor) -> None:

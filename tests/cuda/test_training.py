@@ -124,8 +124,9 @@ def test_a_step_waits_for_nothing_and_stays_on_its_device(
     assert len(nobody.asked) <= 10 + 4 * views
 
 
-def test_hexplane_stays_on_its_device(tiny_scene: Path, nobody: Nobody) -> None:
-    trainer = elsewhere(tiny_scene, preset_of("training.static_until=0", motion="hexplane"))
+@pytest.mark.parametrize("option", ["motion.heads=shared", "motion.heads=separate"])
+def test_hexplane_stays_on_its_device(tiny_scene: Path, nobody: Nobody, option: str) -> None:
+    trainer = elsewhere(tiny_scene, preset_of("training.static_until=0", option, motion="hexplane"))
     for _ in range(5):
         trainer.step()
     assert {"lookup", "lookup_backward", "time_penalty"} <= set(nobody.asked)
