@@ -12,6 +12,7 @@ from torch.autograd import Function
 from torch.autograd.function import once_differentiable
 
 from gsdmsr_cli.errors import DataError
+from gsdmsr_cli.fields.precision import computing_in
 from gsdmsr_cli.motion import Facts, Motion, start_motion
 from gsdmsr_cli.splats import NAMES, Splats
 
@@ -30,12 +31,20 @@ class Model:
         splats: all of them, those that move first: taking them apart then copies nothing.
         motion: holds and moves those that move.
         moving: how many do; the others stay where they are at all times, and cost no motion.
+        precision: what the motion's fields compute in on a GPU, see ``fields.precision``.
     """
 
-    def __init__(self, splats: Splats, motion: Motion, moving: int | None = None) -> None:
+    def __init__(
+        self,
+        splats: Splats,
+        motion: Motion,
+        moving: int | None = None,
+        precision: str = "float32",
+    ) -> None:
         self.splats = splats.map(lambda t: torch.nn.Parameter(t.detach().contiguous()))
         self.motion = motion
         self.moving = len(splats) if moving is None else moving
+        self.precision = precision
 
     def at(self, time: float, teachers: Tensor | None = None) -> Splats:
         """Return the splats at ``time`` in [0, 1].
@@ -62,13 +71,15 @@ class Model:
         return replace(self.splats, **moved)
 
     def _move(self, splats: Splats, time: float, teachers: Tensor | None) -> Splats:
-        moved = self.motion.at(splats, time)
+        with computing_in(self.precision):
+            moved = self.motion.at(splats, time)
         return moved if teachers is None else _spare(splats, moved, teachers)
 
     def penalty(self, time: float, generator: torch.Generator) -> Tensor | None:
         """Return the motion's regularisers, looked at for the splats that move at ``time``."""
         splats = self.splats.map(lambda tensor: tensor[: self.moving])
-        return self.motion.penalty(splats, time, generator) if self.moving else None
+        with computing_in(self.precision):
+            return self.motion.penalty(splats, time, generator) if self.moving else None
 
     def take(self, rows: Tensor) -> None:
         """Make row i what row ``rows[i]`` was; rows is (M,) int64.
@@ -157,7 +168,11 @@ class _Spare(Function):
 
 
 def load_model(
-    tensors: Mapping[str, Tensor], settings: Mapping[str, Any], facts: Facts, progress: float
+    tensors: Mapping[str, Tensor],
+    settings: Mapping[str, Any],
+    facts: Facts,
+    progress: float,
+    precision: str = "float32",
 ) -> Model:
     """Rebuild a model from its saved tensors.
 
@@ -167,6 +182,7 @@ def load_model(
         settings: the motion's name and options.
         facts: the facts the motion was started with.
         progress: how far training had come.
+        precision: see ``Model``.
 
     Raises:
         DataError: a tensor is missing or has another shape than the settings ask for.
@@ -180,7 +196,7 @@ def load_model(
     if not 0 <= moving <= len(splats):
         raise DataError(f"the checkpoint says that {moving} of {len(splats)} splats move")
     motion = start_motion(settings, facts, moving, torch.Generator())
-    model = Model(splats, motion, moving)
+    model = Model(splats, motion, moving, precision)
     model.motion.advance(progress)
     with torch.no_grad():
         for name, tensor in model.motion.tensors().items():

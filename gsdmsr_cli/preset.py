@@ -120,6 +120,8 @@ class TrainingOptions:
         checkpoint_minutes: time between checkpoints [min].
         seed: seed of every random choice.
         threads: number of CPU threads; 0 takes all cores.
+        precision: what the motion's grids and networks are read and computed in on a GPU; values
+            that are trained, and their gradients, are float32 all the same.
     """
 
     steps: int = 10000
@@ -132,6 +134,7 @@ class TrainingOptions:
     checkpoint_minutes: float = 2.0
     seed: int = 0
     threads: int = 0
+    precision: Literal["float32", "bf16", "fp16"] = "float32"
 
     def __post_init__(self) -> None:
         _require_at_least(self, 1, "steps", "views_per_step")

@@ -199,9 +199,11 @@ class Run:
             DataError: there is none, or it is not what the run's description says.
         """
         checkpoint = self.load()
-        settings = self.preset.motion
+        settings, precision = self.preset.motion, self.preset.training.precision
         try:
-            model = load_model(checkpoint.tensors, settings, self.facts, checkpoint.progress)
+            model = load_model(
+                checkpoint.tensors, settings, self.facts, checkpoint.progress, precision
+            )
         except GsdmsrError as error:
             raise DataError(f"{self.root}: its model cannot be loaded: {error}") from error
         for tensor in model.tensors().values():

@@ -16,12 +16,15 @@ from gsdmsr_cli.cuda import compiler, launch
 
 SHIM = Path(__file__).parent / "cuda" / "shim"
 MISSING = None if shutil.which("g++") else "there is no g++ to build the kernels for the CPU with"
+_INCLUDED = re.compile(r'#include "(\w+\.cuh)"')
 _KERNEL = re.compile(r'extern "C" __global__ void (?:__launch_bounds__\([^)]*\) )?(\w+)\(')
 
 
 def kernels_of(source: str) -> list[str]:
-    """Return the names of the kernels of a source."""
-    return _KERNEL.findall((compiler.HERE / f"{source}.cu").read_text(encoding="utf-8"))
+    """Return the names of the kernels of a source and of what it includes."""
+    text = (compiler.HERE / f"{source}.cu").read_text(encoding="utf-8")
+    included = [compiler.HERE / name for name in _INCLUDED.findall(text)]
+    return _KERNEL.findall(text + "".join(path.read_text(encoding="utf-8") for path in included))
 
 
 class Shim:

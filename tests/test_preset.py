@@ -212,6 +212,7 @@ def test_a_malformed_override_is_refused(override: str) -> None:
         "training.checkpoint_minutes=0",
         "training.seed=-1",
         "training.threads=-1",
+        "training.precision=half",
         "losses.ssim=1.5",
         "losses.ssim_until=-0.1",
         "training.average_from=1.5",

@@ -50,7 +50,7 @@ def run(
     """Train the scene in ``data`` and write the run folder ``out``.
 
     Raises:
-        UsageError: an option does not exist, or cannot be changed when resuming.
+        UsageError: an option does not exist, cannot be changed when resuming, or needs a GPU.
         DataError: the data or the run folder cannot be used.
         KeyboardInterrupt: Ctrl-C ended the training; ``out`` holds a checkpoint to go on from.
     """
@@ -64,6 +64,7 @@ def run(
         checkpoint = earlier.load()
         _require_rest(earlier, options, checkpoint)
     where = raster.pick_device(device)
+    _require_precision(options, device, where)
     scene, load_s = _timed(lambda: _read(data))
     if earlier is not None:
         earlier.check_scene(scene)
@@ -86,6 +87,18 @@ def run(
     _say_end(folder, trainer, data, finished)
     if not finished:
         raise KeyboardInterrupt
+
+
+def _require_precision(options: Preset, wanted: str, device: str) -> None:
+    """Raise UsageError if fields are to compute in what the device does not."""
+    precision = options.training.precision
+    if device == "cuda" or precision == "float32":
+        return
+    reason = "--device cpu was given"
+    if wanted != "cpu":
+        missing = raster.load_engine("cuda").unavailable("cuda")
+        reason = f"--device {wanted} takes the CPU, since {missing}"
+    raise UsageError(f"training.precision is {precision}; allowed on the CPU: float32; {reason}")
 
 
 def _read(data: Path) -> Scene:

@@ -1,4 +1,7 @@
-"""Plane grids on tensors: looking features up, penalties, and their gradients, see planes.cu."""
+"""Plane grids on tensors: looking features up, penalties, and their gradients.
+
+See lookup.cuh and planes.cu.
+"""
 
 from __future__ import annotations
 
@@ -15,10 +18,17 @@ from gsdmsr_cli.cuda.compiler import MOST_LEVELS
 from gsdmsr_cli.cuda.launch import blocks, launch
 
 CHANNELS = 16
-"""Of a chunk, as in planes.cu."""
+"""Of a chunk, as in lookup.cuh."""
+
+SOURCES = {
+    torch.float32: "planes",
+    torch.bfloat16: "planes_bf16",
+    torch.float16: "planes_fp16",
+}
+"""Which source looks up nodes of a format."""
 
 _THREADS = 256
-_POINTERS = ("space", "time", "lines", "d_space", "d_time", "d_lines")
+_POINTERS = ("space", "time", "nodes", "lines", "d_space", "d_time", "d_lines")
 
 
 class _Level(ctypes.Structure):
@@ -44,6 +54,7 @@ def lookup(
     time: float,
     to_cube: Sequence[Sequence[float]],
     tensors: Sequence[Tensor],
+    dtype: torch.dtype = torch.float32,
 ) -> Tensor:
     """Return features (N, C + K) of points at one time, all levels and ``beside`` side by side.
 
@@ -53,8 +64,10 @@ def lookup(
         time: in [-1, 1].
         to_cube: what to multiply positions by and what to add, (2, 3), to take them to [-1, 1].
         tensors: of each level space (3, chunks, R, R, 16) and time (3, chunks, T, R, 16).
+        dtype: the format that grids are read in, see ``SOURCES``. Features are float32, and so
+            are gradients, which pass through the rounding as if there were none.
     """
-    features: Tensor = _Lookup.apply(points.contiguous(), beside, time, to_cube, *tensors)
+    features: Tensor = _Lookup.apply(points.contiguous(), beside, time, to_cube, dtype, *tensors)
     return features
 
 
@@ -68,6 +81,7 @@ def _pack(
     time: float,
     to_cube: Sequence[Sequence[float]],
     tensors: Sequence[Tensor],
+    nodes: Sequence[Tensor],
     lines: Sequence[Tensor],
     gradients: Sequence[Tensor] = (),
     d_lines: Sequence[Tensor] = (),
@@ -77,7 +91,7 @@ def _pack(
     if len(spaces) > MOST_LEVELS:
         raise ValueError(f"{len(spaces)} levels of grids; at most {MOST_LEVELS} are looked up")
     packed = _Levels(len(spaces), time, *((ctypes.c_float * 3)(*part) for part in to_cube))
-    columns = spaces, times, lines, gradients[::2], gradients[1::2], d_lines
+    columns = spaces, times, nodes, lines, gradients[::2], gradients[1::2], d_lines
     for name, column in zip(_POINTERS, columns, strict=True):
         for level, tensor in zip(packed.level, column, strict=False):
             if not tensor.is_contiguous():
@@ -88,11 +102,11 @@ def _pack(
     return packed
 
 
-def _over_levels(kernel: str, packed: _Levels, tensors: Sequence[Tensor]) -> None:
+def _over_levels(source: str, kernel: str, packed: _Levels, tensors: Sequence[Tensor]) -> None:
     """Launch a kernel with a thread for each value of the levels' tensors."""
     longest = max(tensor.numel() for tensor in tensors)
     grid = blocks(longest, _THREADS), len(tensors)
-    launch("planes", kernel, grid, _THREADS, packed, on=tensors[0].device)
+    launch(source, kernel, grid, _THREADS, packed, on=tensors[0].device)
 
 
 def _zeros_like(tensors: Sequence[Tensor]) -> list[Tensor]:
@@ -110,19 +124,22 @@ class _Lookup(Function):
         beside: Tensor,
         time: float,
         to_cube: Sequence[Sequence[float]],
+        dtype: torch.dtype,
         *tensors: Tensor,
     ) -> Tensor:
-        lines = [t.new_empty(3, t.shape[1], t.shape[3], CHANNELS) for t in tensors[1::2]]
-        packed = _pack(time, to_cube, tensors, lines)
+        spaces, halved, source = tensors[::2], dtype is not torch.float32, SOURCES[dtype]
+        nodes = [torch.empty_like(t, dtype=dtype) for t in spaces] if halved else spaces
+        lines = [t.new_empty(*t.shape[:2], t.shape[3], CHANNELS, dtype=dtype) for t in spaces]
+        packed = _pack(time, to_cube, tensors, nodes, lines)
         ctx.columns = sum(line.shape[1] * CHANNELS for line in lines)
         features = points.new_empty(len(points), ctx.columns + beside.shape[1])
         features[:, ctx.columns :] = beside
-        _over_levels("collapse", packed, lines)
+        _over_levels(source, "collapse", packed, nodes if halved else lines)
         launch(
-            "planes", "lookup", (blocks(len(points) * CHANNELS, _THREADS), 1), _THREADS,
+            source, "lookup", (blocks(len(points) * CHANNELS, _THREADS), 1), _THREADS,
             packed, len(points), points, features.shape[1], features,
         )  # fmt: skip
-        ctx.when = time, to_cube, lines
+        ctx.given = time, to_cube, dtype, nodes if halved else None, lines
         ctx.save_for_backward(points, *tensors)
         return features
 
@@ -131,20 +148,21 @@ class _Lookup(Function):
     def backward(ctx: Any, d_features: Tensor) -> tuple[Tensor | None, ...]:
         points, *tensors = ctx.saved_tensors
         given, count = d_features.contiguous(), len(tensors) // 2
-        time, to_cube, lines = ctx.when
+        time, to_cube, dtype, nodes, lines = ctx.given
         *d_spaces_and_lines, d_points = _zeros_like([*tensors[::2], *lines, points])
         d_spaces, d_lines = d_spaces_and_lines[:count], d_spaces_and_lines[count:]
         d_times = [torch.empty_like(time) for time in tensors[1::2]]
         gradients = [d for level in zip(d_spaces, d_times, strict=True) for d in level]
-        packed = _pack(time, to_cube, tensors, lines, gradients, d_lines)
-        wanted = ctx.needs_input_grad[0]
+        read = tensors[::2] if nodes is None else nodes
+        packed = _pack(time, to_cube, tensors, read, lines, gradients, d_lines)
+        wanted, source = ctx.needs_input_grad[0], SOURCES[dtype]
         launch(
-            "planes", "lookup_backward", (blocks(len(points) * CHANNELS, _THREADS), 1), _THREADS,
+            source, "lookup_backward", (blocks(len(points) * CHANNELS, _THREADS), 1), _THREADS,
             packed, len(points), points, given.shape[1], given, d_points if wanted else None,
         )  # fmt: skip
-        _over_levels("spread", packed, d_times)
+        _over_levels(source, "spread", packed, d_times)
         d_beside = given[:, ctx.columns :] if ctx.needs_input_grad[1] else None
-        return d_points if wanted else None, d_beside, None, None, *gradients
+        return d_points if wanted else None, d_beside, None, None, None, *gradients
 
 
 class _Penalty(Function):

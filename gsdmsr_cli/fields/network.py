@@ -11,6 +11,8 @@ from torch import Tensor
 from torch.autograd import Function
 from torch.autograd.function import once_differentiable
 
+from gsdmsr_cli.cuda.launch import serves
+from gsdmsr_cli.fields import half, precision
 from gsdmsr_cli.fields.live import live_rows, spread
 from gsdmsr_cli.kernels import network as kernels
 from gsdmsr_cli.kernels.simd import LANES
@@ -53,8 +55,14 @@ def apply_network(layers: Sequence[Layer], x: Tensor) -> Tensor:
 
 
 def apply_networks(networks: Sequence[Sequence[Layer]], x: Tensor) -> tuple[Tensor, ...]:
-    """Return what each of the networks makes of the same x, see ``apply_network``."""
+    """Return what each of the networks makes of the same x, see ``apply_network``.
+
+    On a GPU hidden layers are computed in the format that ``precision`` says.
+    """
     tensors = [tensor for layers in networks for layer in layers for tensor in layer]
+    dtype = precision.chosen()
+    if dtype is not torch.float32 and serves(x, *tensors):
+        return tuple(half.apply_network(layers, x, dtype) for layers in networks)
     if has_kernels(x, *tensors):
         depths = [len(layers) for layers in networks]
         outputs: tuple[Tensor, ...] = _Networks.apply(x.contiguous(), depths, *tensors)

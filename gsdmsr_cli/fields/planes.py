@@ -14,6 +14,7 @@ from torch.autograd.function import once_differentiable
 
 from gsdmsr_cli.cuda import grids
 from gsdmsr_cli.cuda.launch import serves
+from gsdmsr_cli.fields import precision
 from gsdmsr_cli.fields.live import live_rows, spread
 from gsdmsr_cli.kernels import planes as kernels
 from gsdmsr_cli.kernels.simd import LANES
@@ -75,12 +76,14 @@ def lookup(
 
     Each level gives the product of six samples; levels are concatenated. The time is in [-1, 1].
     Coordinates outside are clamped to the border and pass no gradient. Features (N, K) that the
-    points bring along, ``beside``, become the last columns.
+    points bring along, ``beside``, become the last columns. On a GPU grids are read in the format
+    that ``precision`` says.
     """
     tensors = [tensor for level in levels for tensor in level]
     own = points.new_empty(len(points), 0) if beside is None else beside
     if serves(points, own, *tensors):
-        return grids.lookup(points, own, time, _to_cube(box).tolist(), tensors)
+        to_cube = _to_cube(box).tolist()
+        return grids.lookup(points, own, time, to_cube, tensors, precision.chosen())
     if has_kernels(points, own, *tensors):
         features: Tensor = _Lookup.apply(points.contiguous(), own, time, box, *tensors)
         return features

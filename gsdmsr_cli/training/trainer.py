@@ -79,7 +79,8 @@ class Trainer:
         splats = initial_splats(scene, preset.splats, pictures, background, self.generator)
         self.facts = facts_of(scene, splats)
         motion = start_motion(preset.motion, self.facts, len(splats), self.generator)
-        self.model = Model(splats, motion).to(device)
+        precision = preset.training.precision
+        self.model = Model(splats, motion, precision=precision).to(device)
         self.optimizer = Adam()
         self.saliency = Saliency(len(self.model.splats), preset.saliency, device)
         self.statistics = DensityStatistics(len(self.model.splats), device)
@@ -164,7 +165,11 @@ class Trainer:
         if not self.average.count:
             return self.model
         tensors = self.average.tensors | {MOVING: torch.tensor(self.model.moving)}
-        model = load_model(tensors, self.preset.motion, self.facts, self.clock.progress)
+        return self._load(tensors, self.clock.progress)
+
+    def _load(self, tensors: Mapping[str, Tensor], progress: float) -> Model:
+        precision = self.preset.training.precision
+        model = load_model(tensors, self.preset.motion, self.facts, progress, precision)
         return model.to(self.device)
 
     def _penalise(
@@ -370,8 +375,7 @@ class Trainer:
             self.average.tensors = {name: tensors[name] for name in last}
             if MOVING in tensors:
                 last[MOVING] = tensors[MOVING]
-        model = load_model(last, self.preset.motion, self.facts, checkpoint.progress)
-        self.model = model.to(self.device)
+        self.model = self._load(last, checkpoint.progress)
         self.statistics = DensityStatistics(len(self.model.splats))
         scatter(self._parts(), tensors)
         self.optimizer.steps = {name: int(count) for name, count in state["adam_steps"].items()}

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from datasets import noise, write_picture
 
 from gsdmsr_cli import cli, files, imaging
@@ -71,6 +72,10 @@ USAGE = {
     "no value": ("--set training.steps", "a.b=value"),
     "no mapping": ("--set training=3 --steps 4", "training is 3; allowed: a mapping"),
     "bad budget": ("--budget 8x", "allowed: null or a positive duration"),
+    "half precision": (
+        "--set training.precision=bf16 --device cpu",
+        "training.precision is bf16; allowed on the CPU: float32; --device cpu was given$",
+    ),
     "no steps": ("--steps 0", "steps is 0; allowed: 1 or more"),
     "downscale of nothing": ("--downscale 0", "downscale is 0; allowed: 1 or more"),
     "downscale beyond the picture": ("--downscale 49", "48 x 48 px.*allowed: 1 to 48"),
@@ -84,6 +89,17 @@ def test_options_that_do_not_exist_are_refused(
     out = tmp_path / "run"
     assert gsdmsr("train", "--data", tiny_scene, "--out", out, *options.split()) == 2
     assert re.search(message, one_line(capsys))
+    assert not out.exists()
+
+
+def test_half_precision_is_refused_where_no_gpu_is_found(
+    gsdmsr: Gsdmsr, tiny_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any
+) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    out, option = tmp_path / "run", "training.precision=fp16"
+    assert gsdmsr("train", "--data", tiny_scene, "--out", out, "--set", option) == 2
+    said = one_line(capsys)
+    assert "is fp16; allowed on the CPU: float32; --device auto takes the CPU, since torch" in said
     assert not out.exists()
 
 

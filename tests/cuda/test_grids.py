@@ -1,20 +1,40 @@
-"""Plane lookups and penalties on CUDA kernels are their plain torch twins in float64."""
+"""Plane lookups and penalties on CUDA kernels are their plain torch twins in float64.
+
+So are lookups of grids in half precision, where the twin's grids are rounded in the same way.
+"""
 
 from __future__ import annotations
 
+import math
+import shutil
+from pathlib import Path
+
+import cuda_shim
 import pytest
 import torch
 from kernel_checks import assert_near, generator, leaves
 from torch import Tensor
 
-from gsdmsr_cli.cuda import grids
+from gsdmsr_cli.cuda import compiler, grids, launch
 from gsdmsr_cli.cuda.compiler import MOST_LEVELS
-from gsdmsr_cli.fields import planes
+from gsdmsr_cli.fields import planes, precision
 
 pytestmark = pytest.mark.usefixtures("kernels_on_the_cpu")
 
 BOX = (-1.0, -2.0, -0.5), (1.5, 1.0, 2.0)
 TOLERANCE = 2e-5
+
+HALVES = [torch.bfloat16, torch.float16]
+halves = pytest.mark.parametrize("dtype", HALVES, ids=str)
+
+
+def half_tolerance(dtype: torch.dtype) -> float:
+    """At most half of what rounding does, see ``test_half_precision_is_used_where_it_is_chosen``.
+
+    More than float32 needs: on a GPU products and sums are fused, so that a line's node near the
+    middle of two numbers of the format may be rounded to the other one than in the twin.
+    """
+    return torch.finfo(dtype).eps / 8
 
 
 def levels(*shapes: tuple[int, int, int], seed: int = 0) -> list[planes.Level]:
@@ -38,21 +58,51 @@ def points(count: int) -> Tensor:
     return 1.6 * torch.randn(count, 3, generator=generator(3))
 
 
-def compare(place: str, some: list[planes.Level], count: int, time: float, beside: int = 0) -> None:
+def rounded(level: planes.Level, time: float, dtype: torch.dtype) -> planes.Level:
+    """What kernels read of a level at one time: its spatial planes, and lines at all times.
+
+    Gradients go through the rounding as if there were none.
+    """
+    space, planes_of_time = level.space, level.time
+    nodes = space + (space.float().to(dtype) - space).detach()
+    last = planes_of_time.shape[2] - 1
+    u = (torch.tensor(time).clamp(-1, 1) + 1) * 0.5 * last
+    lower = min(int(u), last - 1)
+    low, high = planes_of_time[:, :, lower], planes_of_time[:, :, lower + 1]
+    exact = low + (high - low) * (u - lower)
+    # rounded from float32, as the kernel does
+    line = low.float() + (high.float() - low.float()) * (u - lower)
+    line = exact + (line.to(dtype) - exact).detach()
+    return planes.Level(nodes, torch.stack([line, line], dim=2))
+
+
+def compare(
+    place: str,
+    some: list[planes.Level],
+    count: int,
+    time: float,
+    beside: int = 0,
+    dtype: torch.dtype = torch.float32,
+) -> None:
+    half = dtype is not torch.float32
+    tolerance = half_tolerance(dtype) if half else TOLERANCE
     given = [points(count), torch.randn(count, beside, generator=generator(4)), *tensors_of(some)]
     ours, exact = leaves(given, torch.float32), leaves(given, torch.float64)
     to_cube = planes._to_cube(BOX).tolist()
     there = [tensor.to(place) for tensor in ours]
-    found = grids.lookup(*there[:2], time, to_cube, there[2:]).cpu()
-    expected = planes.lookup_twin(levels_of(exact[2:]), exact[0], time, BOX, exact[1])
-    assert_near(found, expected, TOLERANCE, "features")
+    found = grids.lookup(*there[:2], time, to_cube, there[2:], dtype).cpu()
+    assert found.dtype is torch.float32
+    read = levels_of(exact[2:])
+    read = [rounded(level, time, dtype) for level in read] if half else read
+    expected = planes.lookup_twin(read, exact[0], time, BOX, exact[1])
+    assert_near(found, expected, tolerance, "features")
     slope = torch.randn(expected.shape, generator=generator(5))
     slope[::3] = 0  # rows that nothing is to be learnt from
     found.backward(slope)
     expected.backward(slope.double())
     names = ["points", "beside", *(f"tensor {i}" for i in range(len(exact) - 2))]
     for name, one, other in zip(names, ours, exact, strict=True):
-        assert_near(one.grad, other.grad, TOLERANCE, name)
+        assert_near(one.grad, other.grad, tolerance, name)
 
 
 @pytest.mark.parametrize("time", [-1.0, -0.37, 0.0, 1.0, 1.4])
@@ -86,6 +136,77 @@ def test_points_that_need_no_gradient_get_none() -> None:
     grids.lookup(given, torch.zeros(20, 0), 0.1, to_cube, own).sum().backward()
     assert given.grad is None
     assert own[0].grad is not None and own[0].grad.any()
+
+
+@halves
+@pytest.mark.parametrize("time", [-1.0, -0.37, 0.2, 1.4])
+def test_half_precision(place: str, time: float, dtype: torch.dtype) -> None:
+    compare(place, levels((4, 3, 32), (9, 5, 16)), 300, time, beside=3, dtype=dtype)
+
+
+@halves
+def test_half_precision_is_used_where_it_is_chosen(dtype: torch.dtype) -> None:
+    """What rounding does to features is twice what the tests above allow, or more."""
+    some = levels((4, 3, 32), (9, 5, 16))
+    given = points(300), torch.zeros(300, 0), 0.2, planes._to_cube(BOX).tolist(), tensors_of(some)
+    whole = grids.lookup(*given)
+    with precision.computing_in({torch.bfloat16: "bf16", torch.float16: "fp16"}[dtype]):
+        halved = planes.lookup(some, given[0], 0.2, BOX)
+    assert torch.equal(halved, grids.lookup(*given, dtype))
+    error = (halved - whole).norm() / whole.norm()
+    assert 2 * half_tolerance(dtype) < error < torch.finfo(dtype).eps
+    assert torch.equal(planes.lookup(some, given[0], 0.2, BOX), whole)
+
+
+def test_tiny_gradients_reach_grids_of_half_precision() -> None:
+    for dtype in HALVES:
+        some = [tensor.requires_grad_() for tensor in tensors_of(levels((4, 3, 16)))]
+        given = points(20), torch.zeros(20, 0), 0.2, planes._to_cube(BOX).tolist(), some
+        features = grids.lookup(*given, dtype)
+        slope = torch.rand(features.shape, generator=generator(5))
+        whole, tiny = (torch.autograd.grad(features, some, slope * by, retain_graph=True)
+                       for by in (1, 2.0**-27))  # fmt: skip
+        for one, other in zip(whole, tiny, strict=True):
+            assert one.any() and torch.equal(one, other * 2**27)
+
+
+def test_numbers_are_read_and_rounded_as_torch_does(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """All numbers of both formats; and for writing, those and what lies just beside and between."""
+    shutil.copy(compiler.HERE / "nodes.cuh", tmp_path)
+    kernels = [
+        f"""extern "C" __global__ void {name}({name} *nodes, float *values, int n, int write) {{
+            int i = blockIdx.x * 256 + threadIdx.x;
+            if (i < n && write) store(nodes + i, values[i]);
+            if (i < n && !write) values[i] = load(nodes + i);
+        }}\n"""
+        for name in ("Bf16", "Fp16")
+    ]
+    (tmp_path / "some.cu").write_text('#include "nodes.cuh"\n' + "".join(kernels))
+    monkeypatch.setattr(compiler, "HERE", tmp_path)
+    with cuda_shim.on_the_cpu(tmp_path):
+        for name, dtype in zip(("Bf16", "Fp16"), HALVES, strict=True):
+            nodes = torch.arange(-(1 << 15), 1 << 15).to(torch.int16).view(dtype)
+            values = torch.full(nodes.shape, math.pi)
+            run(name, nodes, values, write=0)
+            torch.testing.assert_close(values, nodes.float(), rtol=0, atol=0, equal_nan=True)
+            between = (values + torch.roll(values, 1)) / 2
+            further = [torch.tensor([1e38, -3.4e38, 65519.99, 65520.0, 1e-30, 2.0**-25, 0.0])]
+            for base in (values, between):
+                for towards in (math.inf, -math.inf):
+                    further += [base, torch.nextafter(base, torch.tensor(towards))]
+            written = torch.cat(further)
+            nodes = torch.zeros(written.shape, dtype=dtype)
+            run(name, nodes, written, write=1)
+            expected = written.to(dtype)
+            torch.testing.assert_close(nodes, expected, rtol=0, atol=0, equal_nan=True)
+            assert torch.equal(nodes.signbit()[expected == 0], expected.signbit()[expected == 0])
+
+
+def run(name: str, nodes: Tensor, values: Tensor, write: int) -> None:
+    count = len(values)
+    launch.launch("some", name, (-(-count // 256), 1), 256, nodes, values, count, write)
 
 
 def test_too_many_levels_are_refused() -> None:

@@ -60,12 +60,13 @@ def comparing(ssim: float, weighted: bool = False) -> list[Tensor]:
     return [loss, *(view.on_screen for view in found), *errors, *gradients]
 
 
-def looking_up() -> list[Tensor]:
+def looking_up(dtype: torch.dtype) -> list[Tensor]:
     rng = generator(2)
     levels = [planes.new_level(r, 4, 16, rng) for r in (3, 8)]
     tensors = [tensor.requires_grad_() for level in levels for tensor in level]
     points = torch.randn(100, 3, generator=rng).requires_grad_()
-    features = grids.lookup(points, torch.ones(100, 2), 0.3, [[1.0] * 3, [0.0] * 3], tensors)
+    given = points, torch.ones(100, 2), 0.3, [[1.0] * 3, [0.0] * 3], tensors
+    features = grids.lookup(*given, dtype)
     value = grids.penalty((0.1, 0.2, 0.3), tensors)
     total = features.square().sum() + value
     return [features, value, *torch.autograd.grad(total, [points, *tensors])]
@@ -76,7 +77,9 @@ WORKS: dict[str, Callable[[], list[Tensor]]] = {
     "L1": lambda: comparing(0.0),
     "L1, weighted tiles": lambda: comparing(0.0, weighted=True),
     "L1 and SSIM": lambda: comparing(0.2),
-    "plane grids": looking_up,
+    "plane grids": lambda: looking_up(torch.float32),
+    "plane grids in bf16": lambda: looking_up(torch.bfloat16),
+    "plane grids in fp16": lambda: looking_up(torch.float16),
 }
 
 

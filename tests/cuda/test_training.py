@@ -41,8 +41,27 @@ class TestOnTheCPU:
             launch.runners["cpu"] = kernels
         assert found == pytest.approx(expected, rel=NEARLY)
 
-    def test_all_phases_of_a_training(self, tiny_scene: Path) -> None:
-        preset = preset_of("saliency.gate=scale", "saliency.gate_from=0.5", "data.downscale=2")
+    def test_half_precision_loses_as_float32_does(self, tiny_scene: Path) -> None:
+        """Within what two engines in float32 may differ by, moving from the first step on."""
+        options = (
+            "training.static_until=0", "motion.coarse_until=0", "density.start=1000",
+            "data.downscale=2",
+        )  # fmt: skip
+
+        def lose(precision: str) -> list[float]:
+            preset = preset_of(*options, f"training.precision={precision}")
+            return losses(trainer_of(tiny_scene, preset, load_engine("cuda")), 15)
+
+        expected = lose("float32")
+        for precision in ("bf16", "fp16"):
+            found = lose(precision)
+            assert found == pytest.approx(expected, rel=NEARLY)
+            assert found != expected
+
+    @pytest.mark.parametrize("precision", ["float32", "bf16"])
+    def test_all_phases_of_a_training(self, tiny_scene: Path, precision: str) -> None:
+        gate = "saliency.gate=scale", "saliency.gate_from=0.5"
+        preset = preset_of(*gate, "data.downscale=2", f"training.precision={precision}")
         trainer = trainer_of(tiny_scene, preset, load_engine("cuda"))
         seen = losses(trainer, STEPS)
         assert all(map(math.isfinite, seen))
@@ -102,6 +121,8 @@ def elsewhere(data: Path, preset: Preset) -> Trainer:
         (("saliency.gate=scale", "saliency.gate_from=0"), "adam"),
         (("saliency.gate=freeze", "saliency.gate_from=0", "saliency.quantile=0.5"), "adam"),
         (("motion.smooth_weight=0.1",), "lookup_backward"),
+        (("training.precision=bf16",), "collapse"),
+        (("training.precision=fp16", "motion.smooth_weight=0.1"), "lookup_backward"),
     ],
 )
 @pytest.mark.parametrize("views", [1, 2])

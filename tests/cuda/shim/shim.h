@@ -265,4 +265,30 @@ inline int __float_as_int(float value) {
     memcpy(&bits, &value, 4);
     return bits;
 }
+inline unsigned __float_as_uint(float value) { return (unsigned)__float_as_int(value); }
+inline float __uint_as_float(unsigned bits) {
+    float value;
+    memcpy(&value, &bits, 4);
+    return value;
+}
 inline float __fdividef(float a, float b) { return a / b; }
+
+// IEEE half precision: 1 bit of sign, 5 of an exponent with bias 15, 10 of a fraction.
+inline float float_of_half(unsigned short bits) {
+    int exponent = bits >> 10 & 31, fraction = bits & 1023;
+    float size = exponent == 31 ? (fraction ? NAN : INFINITY)
+        : exponent == 0 ? ldexpf((float)fraction, -24)
+        : ldexpf((float)(1024 + fraction), exponent - 25);
+    return bits >> 15 ? -size : size;
+}
+inline unsigned short half_of_float(float value) {
+    unsigned short sign = std::signbit(value) ? 0x8000 : 0;
+    if (std::isnan(value)) return 0x7fff;
+    float size = fabsf(value);
+    if (size >= 65520.0f) return sign | 0x7c00;  // midway between the largest and infinity
+    // in units of the last bit, the smallest normal number's for those below it; to the nearest even
+    int exponent = std::max(ilogbf(size), -14);
+    int units = (int)nearbyintf(ldexpf(size, 10 - exponent));
+    // a full fraction carries into the exponent, as it should
+    return sign | (unsigned short)(((exponent + 14) << 10) + units);
+}
