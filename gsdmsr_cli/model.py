@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -13,7 +13,7 @@ from torch.autograd.function import once_differentiable
 
 from gsdmsr_cli.errors import DataError
 from gsdmsr_cli.fields.precision import computing_in
-from gsdmsr_cli.motion import Facts, Motion, start_motion
+from gsdmsr_cli.motion import Facts, Motion, MovingAtOnce, start_motion
 from gsdmsr_cli.splats import NAMES, Splats
 
 STORED_AS = "splats."
@@ -47,33 +47,47 @@ class Model:
         self.precision = precision
 
     def at(self, time: float, teachers: Tensor | None = None) -> Splats:
-        """Return the splats at ``time`` in [0, 1].
+        """Return the splats at ``time`` in [0, 1], see ``at_times``."""
+        return self.at_times([time], teachers)[0]
+
+    def at_times(self, times: Sequence[float], teachers: Tensor | None = None) -> list[Splats]:
+        """Return the splats at each of the times in [0, 1].
 
         Args:
+            times: moved to in one go if the motion can.
             teachers: (N,) bool, the splats whose gradients the motion is to learn from; all if
                 None. The others pass theirs to their canonical values alone, as if what the motion
                 adds to them were constant.
         """
         if self.moving == len(self.splats):
-            return self._move(self.splats, time, teachers)
+            return self._move(self.splats, times, teachers)
         if not self.moving:
-            return self.splats
+            return [self.splats] * len(times)
         sizes = [self.moving, len(self.splats) - self.moving]
         parts = {name: tensor.split(sizes) for name, tensor in self.splats.tensors().items()}
         before = Splats(**{name: first for name, (first, _) in parts.items()})
         own = None if teachers is None else teachers[: self.moving]
-        after = self._move(before, time, own).tensors()
-        moved = {
-            name: torch.cat([after[name], still])
-            for name, (first, still) in parts.items()
-            if after[name] is not first  # what the motion leaves alone needs no copy
-        }
-        return replace(self.splats, **moved)
+        moved = []
+        for moment in self._move(before, times, own):
+            after = moment.tensors()
+            whole = {
+                name: torch.cat([after[name], still])
+                for name, (first, still) in parts.items()
+                if after[name] is not first  # what the motion leaves alone needs no copy
+            }
+            moved.append(replace(self.splats, **whole))
+        return moved
 
-    def _move(self, splats: Splats, time: float, teachers: Tensor | None) -> Splats:
+    def _move(
+        self, splats: Splats, times: Sequence[float], teachers: Tensor | None
+    ) -> list[Splats]:
+        motion = self.motion
         with computing_in(self.precision):
-            moved = self.motion.at(splats, time)
-        return moved if teachers is None else _spare(splats, moved, teachers)
+            if len(times) > 1 and isinstance(motion, MovingAtOnce):
+                moved = motion.at_times(splats, times)
+            else:
+                moved = [motion.at(splats, time) for time in times]
+        return moved if teachers is None else [_spare(splats, one, teachers) for one in moved]
 
     def penalty(self, time: float, generator: torch.Generator) -> Tensor | None:
         """Return the motion's regularisers, looked at for the splats that move at ``time``."""

@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.autograd import Function
 from torch.autograd.function import once_differentiable
 
-from gsdmsr_cli.cuda.compiler import MOST_LEVELS
+from gsdmsr_cli.cuda.compiler import MOST_LEVELS, MOST_VIEWS
 from gsdmsr_cli.cuda.launch import blocks, launch
 
 CHANNELS = 16
@@ -41,7 +41,8 @@ class _Level(ctypes.Structure):
 class _Levels(ctypes.Structure):
     _fields_ = (
         ("count", ctypes.c_int),
-        ("time", ctypes.c_float),
+        ("moments", ctypes.c_int),
+        ("moment", ctypes.c_float * MOST_VIEWS),
         ("scale", ctypes.c_float * 3),
         ("shift", ctypes.c_float * 3),
         ("level", _Level * MOST_LEVELS),
@@ -51,23 +52,23 @@ class _Levels(ctypes.Structure):
 def lookup(
     points: Tensor,
     beside: Tensor,
-    time: float,
+    times: Sequence[float],
     to_cube: Sequence[Sequence[float]],
     tensors: Sequence[Tensor],
     dtype: torch.dtype = torch.float32,
 ) -> Tensor:
-    """Return features (N, C + K) of points at one time, all levels and ``beside`` side by side.
+    """Return features (V N, C + K) of points at V times, all levels and ``beside`` side by side.
 
     Args:
         points: (N, 3).
         beside: (N, K), the last columns.
-        time: in [-1, 1].
+        times: each in [-1, 1].
         to_cube: what to multiply positions by and what to add, (2, 3), to take them to [-1, 1].
         tensors: of each level space (3, chunks, R, R, 16) and time (3, chunks, T, R, 16).
         dtype: the format that grids are read in, see ``SOURCES``. Features are float32, and so
             are gradients, which pass through the rounding as if there were none.
     """
-    features: Tensor = _Lookup.apply(points.contiguous(), beside, time, to_cube, dtype, *tensors)
+    features: Tensor = _Lookup.apply(points.contiguous(), beside, times, to_cube, dtype, *tensors)
     return features
 
 
@@ -78,7 +79,7 @@ def penalty(weights: tuple[float, float, float], tensors: Sequence[Tensor]) -> T
 
 
 def _pack(
-    time: float,
+    moments: Sequence[float],
     to_cube: Sequence[Sequence[float]],
     tensors: Sequence[Tensor],
     nodes: Sequence[Tensor],
@@ -90,7 +91,10 @@ def _pack(
     spaces, times = tensors[::2], tensors[1::2]
     if len(spaces) > MOST_LEVELS:
         raise ValueError(f"{len(spaces)} levels of grids; at most {MOST_LEVELS} are looked up")
-    packed = _Levels(len(spaces), time, *((ctypes.c_float * 3)(*part) for part in to_cube))
+    if len(moments) > MOST_VIEWS:
+        raise ValueError(f"{len(moments)} times; at most {MOST_VIEWS} are looked up at once")
+    cube = ((ctypes.c_float * 3)(*part) for part in to_cube)
+    packed = _Levels(len(spaces), len(moments), (ctypes.c_float * MOST_VIEWS)(*moments), *cube)
     columns = spaces, times, nodes, lines, gradients[::2], gradients[1::2], d_lines
     for name, column in zip(_POINTERS, columns, strict=True):
         for level, tensor in zip(packed.level, column, strict=False):
@@ -103,9 +107,9 @@ def _pack(
 
 
 def _over_levels(source: str, kernel: str, packed: _Levels, tensors: Sequence[Tensor]) -> None:
-    """Launch a kernel with a thread for each value of the levels' tensors."""
+    """Launch a kernel with a thread for each value of a level's longest tensor."""
     longest = max(tensor.numel() for tensor in tensors)
-    grid = blocks(longest, _THREADS), len(tensors)
+    grid = blocks(longest, _THREADS), packed.count
     launch(source, kernel, grid, _THREADS, packed, on=tensors[0].device)
 
 
@@ -122,46 +126,51 @@ class _Lookup(Function):
         ctx: Any,
         points: Tensor,
         beside: Tensor,
-        time: float,
+        times: Sequence[float],
         to_cube: Sequence[Sequence[float]],
         dtype: torch.dtype,
         *tensors: Tensor,
     ) -> Tensor:
         spaces, halved, source = tensors[::2], dtype is not torch.float32, SOURCES[dtype]
         nodes = [torch.empty_like(t, dtype=dtype) for t in spaces] if halved else spaces
-        lines = [t.new_empty(*t.shape[:2], t.shape[3], CHANNELS, dtype=dtype) for t in spaces]
-        packed = _pack(time, to_cube, tensors, nodes, lines)
-        ctx.columns = sum(line.shape[1] * CHANNELS for line in lines)
-        features = points.new_empty(len(points), ctx.columns + beside.shape[1])
-        features[:, ctx.columns :] = beside
-        _over_levels(source, "collapse", packed, nodes if halved else lines)
+        lines = [
+            space.new_empty(len(times), *space[:, :, 0].shape, dtype=dtype) for space in spaces
+        ]
+        packed = _pack(times, to_cube, tensors, nodes, lines)
+        ctx.columns = sum(space.shape[1] * CHANNELS for space in spaces)
+        features = points.new_empty(len(times), len(points), ctx.columns + beside.shape[1])
+        features[:, :, ctx.columns :] = beside
+        _over_levels(source, "collapse", packed, [*nodes, *lines] if halved else lines)
         launch(
             source, "lookup", (blocks(len(points) * CHANNELS, _THREADS), 1), _THREADS,
-            packed, len(points), points, features.shape[1], features,
+            packed, len(points), points, features.shape[2], features,
         )  # fmt: skip
-        ctx.given = time, to_cube, dtype, nodes if halved else None, lines
+        ctx.given = times, to_cube, dtype, nodes if halved else None, lines
         ctx.save_for_backward(points, *tensors)
-        return features
+        return features.flatten(0, 1)
 
     @staticmethod
     @once_differentiable  # type: ignore[untyped-decorator]
     def backward(ctx: Any, d_features: Tensor) -> tuple[Tensor | None, ...]:
         points, *tensors = ctx.saved_tensors
         given, count = d_features.contiguous(), len(tensors) // 2
-        time, to_cube, dtype, nodes, lines = ctx.given
+        times, to_cube, dtype, nodes, lines = ctx.given
         *d_spaces_and_lines, d_points = _zeros_like([*tensors[::2], *lines, points])
         d_spaces, d_lines = d_spaces_and_lines[:count], d_spaces_and_lines[count:]
         d_times = [torch.empty_like(time) for time in tensors[1::2]]
         gradients = [d for level in zip(d_spaces, d_times, strict=True) for d in level]
         read = tensors[::2] if nodes is None else nodes
-        packed = _pack(time, to_cube, tensors, read, lines, gradients, d_lines)
+        packed = _pack(times, to_cube, tensors, read, lines, gradients, d_lines)
         wanted, source = ctx.needs_input_grad[0], SOURCES[dtype]
         launch(
             source, "lookup_backward", (blocks(len(points) * CHANNELS, _THREADS), 1), _THREADS,
             packed, len(points), points, given.shape[1], given, d_points if wanted else None,
         )  # fmt: skip
         _over_levels(source, "spread", packed, d_times)
-        d_beside = given[:, ctx.columns :] if ctx.needs_input_grad[1] else None
+        d_beside = None
+        if ctx.needs_input_grad[1]:
+            own = given[:, ctx.columns :]
+            d_beside = own if len(times) == 1 else own.view(len(times), len(points), -1).sum(dim=0)
         return d_points if wanted else None, d_beside, None, None, None, *gradients
 
 

@@ -3,7 +3,8 @@
 // A level holds three spatial planes (xy, xz, yz) and three temporal ones (x, y, z against time), in
 // chunks of 16 channels: space is (3, chunks, R, R, 16) with a plane's second axis first, time is (3,
 // chunks, T, R, 16). All points of a frame share one time, so the temporal planes collapse to three
-// lines. The feature is the product of the six samples, positions clamped to the border.
+// lines. The feature is the product of the six samples, positions clamped to the border. The same points may
+// be looked up at several times: what they read of space, and add to its gradients, is then done once.
 //
 // 16 lanes, half a warp, do one point: a lane per channel of a chunk, so that a node is one access of
 // 64 bytes, and so is the atomic addition to it.
@@ -20,14 +21,14 @@
 struct Level {
     const float *space, *time;
     NODE *nodes;  // of the spatial planes: a copy, or themselves where they are read in float32
-    NODE *lines;  // (3, chunks, R, 16), the temporal planes at the time
+    NODE *lines;  // (moments, 3, chunks, R, 16), the temporal planes at each time
     float *d_space, *d_time, *d_lines;
     int size, times, chunks;  // nodes along a spatial axis and in time
 };
 
 struct Levels {
-    int count;
-    float time;  // in [-1, 1]
+    int count, moments;
+    float moment[MOST_VIEWS];  // the times, in [-1, 1]
     float scale[3], shift[3];  // take positions to [-1, 1]
     Level level[MOST_LEVELS];
 };
@@ -55,25 +56,31 @@ extern "C" __global__ void __launch_bounds__(THREADS) collapse(
     int row = level.size * CHANNELS, k = blockIdx.x * THREADS + threadIdx.x;
     if (sizeof(NODE) < sizeof(float) && k < 3 * level.chunks * level.size * row)
         store(level.nodes + k, level.space[k]);
-    if (k >= 3 * level.chunks * row) return;
-    Cell at = cell(levels.time, level.times);
-    const float *low = level.time + (size_t)(k / row * level.times + at.lower) * row + k % row;
+    int lines = 3 * level.chunks * row;
+    if (k >= levels.moments * lines) return;
+    Cell at = cell(levels.moment[k / lines], level.times);
+    int line = k % lines / row;
+    const float *low = level.time + (size_t)(line * level.times + at.lower) * row + k % row;
     store(level.lines + k, low[0] + (low[row] - low[0]) * at.upper_weight);
 }
 
-// Writes the gradients of the temporal planes: those of the lines at two times, 0 at others.
+// Writes the gradients of the temporal planes: of each time those of the lines at two nodes, 0 at others.
 extern "C" __global__ void __launch_bounds__(THREADS) spread(
     const __grid_constant__ Levels levels
 ) {
     const Level &level = levels.level[blockIdx.y];
     int row = level.size * CHANNELS, k = blockIdx.x * THREADS + threadIdx.x;
     if (k >= 3 * level.chunks * level.times * row) return;
-    Cell at = cell(levels.time, level.times);
-    int node = k / row % level.times - at.lower;
-    float weight = node == 0 ? 1.0f - at.upper_weight : node == 1 ? at.upper_weight : 0.0f;
-    // not multiplied where the weight is 0: what is not finite must not spread
-    level.d_time[k] = weight == 0.0f
-        ? 0.0f : weight * level.d_lines[k / (row * level.times) * row + k % row];
+    const float *d_line = level.d_lines + k / (row * level.times) * row + k % row;
+    float d = 0.0f;
+    for (int m = 0; m < levels.moments; m++, d_line += 3 * level.chunks * row) {
+        Cell at = cell(levels.moment[m], level.times);
+        int node = k / row % level.times - at.lower;
+        float weight = node == 0 ? 1.0f - at.upper_weight : node == 1 ? at.upper_weight : 0.0f;
+        // not multiplied where the weight is 0: what is not finite must not spread
+        if (weight != 0.0f) d += weight * *d_line;
+    }
+    level.d_time[k] = d;
 }
 
 // A sample of a plane or a line, its derivatives in cells, and where its lowest node is.
@@ -107,9 +114,13 @@ __device__ __forceinline__ Sample linear(const NODE *line, int base, const Cell 
     return s;
 }
 
-// All six samples of a chunk of a level.
-struct Samples {
-    Sample xy, xz, yz, x, y, z;
+// The samples of a chunk of a level: in space, and at one time.
+struct InSpace {
+    Sample xy, xz, yz;
+};
+
+struct InTime {
+    Sample x, y, z;
 };
 
 struct Cells {
@@ -126,22 +137,31 @@ __device__ __forceinline__ Cells cells_of(
     };
 }
 
-__device__ __forceinline__ Samples samples_of(
+__device__ __forceinline__ InSpace in_space(
     const Level &level, const Cells &c, int chunk, int lane
 ) {
-    int plane = level.size * level.size * CHANNELS, line = level.size * CHANNELS;
+    int plane = level.size * level.size * CHANNELS;
     int second = level.chunks + chunk, third = 2 * level.chunks + chunk;
     return {
         bilinear(level.nodes, level.size, chunk * plane, c.x, c.y, lane),
         bilinear(level.nodes, level.size, second * plane, c.x, c.z, lane),
         bilinear(level.nodes, level.size, third * plane, c.y, c.z, lane),
-        linear(level.lines, chunk * line, c.x, lane),
-        linear(level.lines, second * line, c.y, lane),
-        linear(level.lines, third * line, c.z, lane),
     };
 }
 
-// Writes the levels side by side into rows of `width` features; columns beyond are left as they are.
+__device__ __forceinline__ InTime in_time(
+    const Level &level, const Cells &c, int moment, int chunk, int lane
+) {
+    int line = level.size * CHANNELS, first = 3 * moment * level.chunks + chunk;
+    return {
+        linear(level.lines, first * line, c.x, lane),
+        linear(level.lines, (first + level.chunks) * line, c.y, lane),
+        linear(level.lines, (first + 2 * level.chunks) * line, c.z, lane),
+    };
+}
+
+// Writes the levels side by side into rows of `width` features, n for each time; columns beyond are left as
+// they are.
 extern "C" __global__ void __launch_bounds__(THREADS) lookup(
     const __grid_constant__ Levels levels, int n, const float *points, int width, float *features
 ) {
@@ -153,8 +173,12 @@ extern "C" __global__ void __launch_bounds__(THREADS) lookup(
         const Level &level = levels.level[l];
         Cells c = cells_of(levels, level, points + 3 * (size_t)i);
         for (int chunk = 0; chunk < level.chunks; chunk++, out += CHANNELS) {
-            Samples s = samples_of(level, c, chunk, lane);
-            *out = s.xy.value * s.xz.value * s.yz.value * s.x.value * s.y.value * s.z.value;
+            InSpace s = in_space(level, c, chunk, lane);
+            float of_space = s.xy.value * s.xz.value * s.yz.value;
+            for (int m = 0; m < levels.moments; m++) {
+                InTime t = in_time(level, c, m, chunk, lane);
+                out[(size_t)m * n * width] = of_space * t.x.value * t.y.value * t.z.value;
+            }
         }
     }
 }
@@ -199,29 +223,38 @@ extern "C" __global__ void __launch_bounds__(THREADS) lookup_backward(
         int row = level.size * CHANNELS;
         float cells = 0.5f * (level.size - 1);
         for (int chunk = 0; chunk < level.chunks; chunk++, given += CHANNELS) {
-            float d = *given;
-            if (!there || d == 0.0f) continue;
-            Samples s = samples_of(level, c, chunk, lane);
+            bool taught = false;
+            for (int m = 0; m < levels.moments; m++)
+                taught |= given[(size_t)m * n * width] != 0.0f;
+            if (!there || !taught) continue;
+            InSpace s = in_space(level, c, chunk, lane);
             float of_space = s.xy.value * s.xz.value * s.yz.value;
-            float of_time = s.x.value * s.y.value * s.z.value;
-            float d_xy = d * of_time * s.xz.value * s.yz.value;
-            float d_xz = d * of_time * s.xy.value * s.yz.value;
-            float d_yz = d * of_time * s.xy.value * s.xz.value;
-            float d_x = d * of_space * s.y.value * s.z.value;
-            float d_y = d * of_space * s.x.value * s.z.value;
-            float d_z = d * of_space * s.x.value * s.y.value;
-            float gx = d_xy * s.xy.by_first + d_xz * s.xz.by_first + d_x * s.x.by_first;
-            float gy = d_xy * s.xy.by_second + d_yz * s.yz.by_first + d_y * s.y.by_first;
-            float gz = d_xz * s.xz.by_second + d_yz * s.yz.by_second + d_z * s.z.by_first;
+            float gx = 0.0f, gy = 0.0f, gz = 0.0f, d_of_space = 0.0f;
+            for (int m = 0; m < levels.moments; m++) {
+                float d = given[(size_t)m * n * width];
+                if (d == 0.0f) continue;
+                InTime t = in_time(level, c, m, chunk, lane);
+                d_of_space += d * (t.x.value * t.y.value * t.z.value);
+                float d_x = d * of_space * t.y.value * t.z.value;
+                float d_y = d * of_space * t.x.value * t.z.value;
+                float d_z = d * of_space * t.x.value * t.y.value;
+                gx += d_x * t.x.by_first, gy += d_y * t.y.by_first, gz += d_z * t.z.by_first;
+                scatter_linear(level.d_lines, t.x.at, c.x, d_x);
+                scatter_linear(level.d_lines, t.y.at, c.y, d_y);
+                scatter_linear(level.d_lines, t.z.at, c.z, d_z);
+            }
+            float d_xy = d_of_space * s.xz.value * s.yz.value;
+            float d_xz = d_of_space * s.xy.value * s.yz.value;
+            float d_yz = d_of_space * s.xy.value * s.xz.value;
+            gx += d_xy * s.xy.by_first + d_xz * s.xz.by_first;
+            gy += d_xy * s.xy.by_second + d_yz * s.yz.by_first;
+            gz += d_xz * s.xz.by_second + d_yz * s.yz.by_second;
             by_x += c.x.inside * cells * gx;
             by_y += c.y.inside * cells * gy;
             by_z += c.z.inside * cells * gz;
             scatter_bilinear(level.d_space, s.xy.at, row, c.x, c.y, d_xy);
             scatter_bilinear(level.d_space, s.xz.at, row, c.x, c.z, d_xz);
             scatter_bilinear(level.d_space, s.yz.at, row, c.y, c.z, d_yz);
-            scatter_linear(level.d_lines, s.x.at, c.x, d_x);
-            scatter_linear(level.d_lines, s.y.at, c.y, d_y);
-            scatter_linear(level.d_lines, s.z.at, c.z, d_z);
         }
     }
     if (!d_points) return;

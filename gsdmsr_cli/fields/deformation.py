@@ -81,6 +81,11 @@ class _Displace(Function):
         return d_means, d_quats, d_log_scales, d_deformation, d_shift, None
 
 
+def split_times(rows: Tensor, count: int) -> Sequence[Tensor]:
+    """Return the rows (N, K) of each of ``count`` times, which ``rows`` (count N, K) holds."""
+    return [rows] if count == 1 else rows.unflatten(0, (count, len(rows) // count)).unbind()
+
+
 def time_nodes(frames: int, cells_per_frame: float, least: int = 8) -> int:
     """Return the nodes of a time grid for so many distinct times, ``least`` or more."""
     return max(round(frames * cells_per_frame), least)

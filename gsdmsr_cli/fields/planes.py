@@ -79,15 +79,28 @@ def lookup(
     points bring along, ``beside``, become the last columns. On a GPU grids are read in the format
     that ``precision`` says.
     """
+    return lookup_at_times(levels, points, [time], box, beside)
+
+
+def lookup_at_times(
+    levels: Sequence[Level],
+    points: Tensor,
+    times: Sequence[float],
+    box: Box = CUBE,
+    beside: Tensor | None = None,
+) -> Tensor:
+    """Return what ``lookup`` does at each of V times, (V N, C), one time after the other."""
     tensors = [tensor for level in levels for tensor in level]
     own = points.new_empty(len(points), 0) if beside is None else beside
     if serves(points, own, *tensors):
         to_cube = _to_cube(box).tolist()
-        return grids.lookup(points, own, time, to_cube, tensors, precision.chosen())
+        return grids.lookup(points, own, times, to_cube, tensors, precision.chosen())
     if has_kernels(points, own, *tensors):
-        features: Tensor = _Lookup.apply(points.contiguous(), own, time, box, *tensors)
-        return features
-    return lookup_twin(levels, points, time, box, own)
+        given = points.contiguous()
+        features = [_Lookup.apply(given, own, time, box, *tensors) for time in times]
+    else:
+        features = [lookup_twin(levels, points, time, box, own) for time in times]
+    return features[0] if len(features) == 1 else torch.cat(features)
 
 
 def lookup_twin(

@@ -7,9 +7,9 @@ import one another; what they share lies in ``gsdmsr_cli.fields``.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
@@ -62,6 +62,14 @@ class Motion(Protocol):
         "planes" or "network" where all splats share it; "embeddings" or the name of a splat's
         tensor, such as "means", where it has a row for each of them.
         """
+
+
+@runtime_checkable
+class MovingAtOnce(Motion, Protocol):
+    """A motion that moves splats to several times with less work than one after the other."""
+
+    def at_times(self, splats: Splats, times: Sequence[float]) -> list[Splats]:
+        """Return what ``at`` does at each of the times."""
 
 
 def motion_options(settings: Mapping[str, Any]) -> Any:

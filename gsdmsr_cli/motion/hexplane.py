@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -14,6 +15,7 @@ from gsdmsr_cli.fields.deformation import (
     PARTS,
     displace,
     name_tensors,
+    split_times,
     time_nodes,
     trained,
 )
@@ -67,9 +69,15 @@ class HexPlaneMotion:
 
     def at(self, splats: Splats, time: float) -> Splats:
         """Return the deformed splats; time is mapped to the whole grid, [-1, 1]."""
+        return self.at_times(splats, [time])[0]
+
+    def at_times(self, splats: Splats, times: Sequence[float]) -> list[Splats]:
+        """Return the deformed splats at several times."""
         points = splats.means.detach() if self.options.detach else splats.means
-        features = planes.lookup(self.levels, points, 2 * time - 1, self.facts.box)
-        return displace(splats, network.apply_network(self._network(), features))
+        moments = [2 * time - 1 for time in times]
+        features = planes.lookup_at_times(self.levels, points, moments, self.facts.box)
+        deformations = network.apply_network(self._network(), features)
+        return [displace(splats, own) for own in split_times(deformations, len(times))]
 
     def _network(self) -> list[network.Layer]:
         """Return the layers, of which the last reads for each output its own head alone."""

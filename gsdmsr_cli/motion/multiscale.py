@@ -10,13 +10,21 @@ Beyond the method, every splat has features of its own for the fine decoder (E-D
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from gsdmsr_cli.fields import network, planes
-from gsdmsr_cli.fields.deformation import OUTPUTS, displace, name_tensors, time_nodes, trained
+from gsdmsr_cli.fields.deformation import (
+    OUTPUTS,
+    displace,
+    name_tensors,
+    split_times,
+    time_nodes,
+    trained,
+)
 from gsdmsr_cli.motion import Facts
 from gsdmsr_cli.splats import Splats
 
@@ -99,17 +107,21 @@ class MultiscaleMotion:
         self.embeddings = torch.nn.Parameter(torch.zeros(count, options.embedding))
 
     def at(self, splats: Splats, time: float) -> Splats:
-        """Return the deformed splats; time is mapped to the whole grids, [-1, 1].
+        """Return the deformed splats; time is mapped to the whole grids, [-1, 1]."""
+        return self.at_times(splats, [time])[0]
+
+    def at_times(self, splats: Splats, times: Sequence[float]) -> list[Splats]:
+        """Return the deformed splats at several times.
 
         All grids are read in one go, the coarse one first: its decoder reads those columns only.
         """
         if not self.fine_active:
-            features = self._features(self.coarse, splats, time)
-            offset = network.apply_network(self.coarse_decoder, features)
-            return replace(splats, means=splats.means + offset)
-        features = self._features(self.coarse + self.fine, splats, time, self.embeddings)
-        offset, deformation = self._decode(features)
-        return displace(splats, deformation, offset)
+            features = self._features(self.coarse, splats, times)
+            offsets = split_times(network.apply_network(self.coarse_decoder, features), len(times))
+            return [replace(splats, means=splats.means + offset) for offset in offsets]
+        features = self._features(self.coarse + self.fine, splats, times, self.embeddings)
+        parts = [split_times(part, len(times)) for part in self._decode(features)]
+        return [displace(splats, own, offset) for offset, own in zip(*parts, strict=True)]
 
     def _decode(self, features: Tensor) -> tuple[Tensor, ...]:
         """Return what both decoders make of the features of all grids, the coarse one's first."""
@@ -123,11 +135,12 @@ class MultiscaleMotion:
         self,
         levels: list[planes.Level],
         splats: Splats,
-        time: float,
+        times: Sequence[float],
         embeddings: Tensor | None = None,
     ) -> Tensor:
         points = splats.means.detach() if self.options.detach else splats.means
-        return planes.lookup(levels, points, 2 * time - 1, self.facts.box, embeddings)
+        moments = [2 * time - 1 for time in times]
+        return planes.lookup_at_times(levels, points, moments, self.facts.box, embeddings)
 
     def take(self, rows: Tensor) -> None:
         """Resize the splats' own features."""
@@ -143,7 +156,7 @@ class MultiscaleMotion:
         levels = self.coarse + self.fine if self.fine_active else self.coarse
         value = planes.penalty(levels, o.space_smoothness, o.time_smoothness, o.time_stillness)
         if o.offset_weight > 0:
-            features = self._features(self.coarse, splats, time)
+            features = self._features(self.coarse, splats, [time])
             offset = network.apply_network(self.coarse_decoder, features) / self.facts.bound
             value = value + o.offset_weight * offset.square().sum(dim=1).mean()
         if o.smooth_weight > 0 and self.fine_active:
@@ -162,7 +175,7 @@ class MultiscaleMotion:
         beside = places + reach * torch.randn(places.shape, generator=generator).to(places)
         own = self.embeddings[rows].repeat(2, 1)
         both = replace(splats.take(rows.repeat(2)), means=torch.cat([places, beside]))
-        features = self._features(self.coarse + self.fine, both, time, own)
+        features = self._features(self.coarse + self.fine, both, [time], own)
         here, there = self._decode(features)[1].chunk(2)
         return (here - there).square().sum(dim=1).mean()
 

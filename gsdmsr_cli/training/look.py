@@ -104,25 +104,29 @@ class Observer:
         cameras = [pictures.camera(view) for pictures, view in pairs]
         targets = [self._resident.load(pictures, view) for pictures, view in pairs]
         masks = [pictures.counted(view) for pictures, view in pairs]
-        times = [view.time if stage.moving else None for view in views]
+        times = [view.time for view in views]
         weights = [None if own is None else own.to(self.background.device) for own in tile_weights]
         further = self._ssim_weight(stage.progress), self._sh_degree(stage.progress)
         together = _alike(cameras, weights) and all(mask is None for mask in masks)
         if together and isinstance(self.engine, ComparingViews):
-            moved = {time: self._moved(model, time, stage) for time in dict.fromkeys(times)}
-            given = self.engine, model, [moved[time] for time in times], cameras
+            given = self.engine, model, self._moved(model, times, stage), cameras
             return compare_views(*given, self.background, targets, *further, weights)
         looks = zip(times, cameras, targets, weights, masks, strict=True)
         return [
             compare(
-                self.engine, model, self._moved(model, time, stage), camera, self.background,
+                self.engine, model, self._moved(model, [time], stage)[0], camera, self.background,
                 target, *further, own, mask,
             )
             for time, camera, target, own, mask in looks
         ]  # fmt: skip
 
-    def _moved(self, model: Model, time: float | None, stage: Stage) -> Splats:
-        return model.splats if time is None else model.at(time, stage.teachers)
+    def _moved(self, model: Model, times: Sequence[float], stage: Stage) -> list[Splats]:
+        """Return the splats at each of the times, the very same ones where times are equal."""
+        if not stage.moving:
+            return [model.splats] * len(times)
+        distinct = list(dict.fromkeys(times))
+        moved = dict(zip(distinct, model.at_times(distinct, stage.teachers), strict=True))
+        return [moved[time] for time in times]
 
     def tiles(self, view: View, progress: float) -> int:
         """Return how many tiles a view's picture has, or 0 where they may not be chosen."""

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 import shutil
+from collections.abc import Sequence
 from pathlib import Path
 
 import cuda_shim
@@ -16,7 +17,7 @@ from kernel_checks import assert_near, generator, leaves
 from torch import Tensor
 
 from gsdmsr_cli.cuda import compiler, grids, launch
-from gsdmsr_cli.cuda.compiler import MOST_LEVELS
+from gsdmsr_cli.cuda.compiler import MOST_LEVELS, MOST_VIEWS
 from gsdmsr_cli.fields import planes, precision
 
 pytestmark = pytest.mark.usefixtures("kernels_on_the_cpu")
@@ -80,7 +81,7 @@ def compare(
     place: str,
     some: list[planes.Level],
     count: int,
-    time: float,
+    times: Sequence[float],
     beside: int = 0,
     dtype: torch.dtype = torch.float32,
 ) -> None:
@@ -90,11 +91,14 @@ def compare(
     ours, exact = leaves(given, torch.float32), leaves(given, torch.float64)
     to_cube = planes._to_cube(BOX).tolist()
     there = [tensor.to(place) for tensor in ours]
-    found = grids.lookup(*there[:2], time, to_cube, there[2:], dtype).cpu()
+    found = grids.lookup(*there[:2], times, to_cube, there[2:], dtype).cpu()
     assert found.dtype is torch.float32
-    read = levels_of(exact[2:])
-    read = [rounded(level, time, dtype) for level in read] if half else read
-    expected = planes.lookup_twin(read, exact[0], time, BOX, exact[1])
+    parts = []
+    for time in times:
+        read = levels_of(exact[2:])
+        read = [rounded(level, time, dtype) for level in read] if half else read
+        parts.append(planes.lookup_twin(read, exact[0], time, BOX, exact[1]))
+    expected = torch.cat(parts)
     assert_near(found, expected, tolerance, "features")
     slope = torch.randn(expected.shape, generator=generator(5))
     slope[::3] = 0  # rows that nothing is to be learnt from
@@ -107,18 +111,25 @@ def compare(
 
 @pytest.mark.parametrize("time", [-1.0, -0.37, 0.0, 1.0, 1.4])
 def test_features_and_gradients_at_all_times(place: str, time: float) -> None:
-    compare(place, levels((5, 4, 16)), 33, time)
+    compare(place, levels((5, 4, 16)), 33, [time])
 
 
 @pytest.mark.parametrize("count", [1, 15, 16, 17, 300])
 def test_any_number_of_points(place: str, count: int) -> None:
-    compare(place, levels((4, 3, 32), (9, 5, 16)), count, 0.2, beside=3)
+    compare(place, levels((4, 3, 32), (9, 5, 16)), count, [0.2], beside=3)
+
+
+@pytest.mark.parametrize("times", [(0.3, 0.3), (-1.0, 0.1, 1.0, 0.4, -0.2)], ids=str)
+@pytest.mark.parametrize("count", [1, 32])
+def test_several_times_at_once(place: str, count: int, times: tuple[float, ...]) -> None:
+    """Also where nothing is to be learnt from a point at one time, but from others."""
+    compare(place, levels((4, 3, 32), (9, 5, 16)), count, times, beside=3)
 
 
 def test_no_points_have_no_features_and_teach_nothing() -> None:
     own = leaves(tensors_of(levels((4, 3, 16))), torch.float32)
     to_cube = planes._to_cube(BOX).tolist()
-    features = grids.lookup(torch.zeros(0, 3), torch.zeros(0, 2), 0.0, to_cube, own)
+    features = grids.lookup(torch.zeros(0, 3), torch.zeros(0, 2), [0.0, 1.0], to_cube, own)
     assert features.shape == (0, 18)
     features.sum().backward()
     for tensor in own:
@@ -126,14 +137,14 @@ def test_no_points_have_no_features_and_teach_nothing() -> None:
 
 
 def test_the_smallest_grid(place: str) -> None:
-    compare(place, levels((2, 2, 16)), 20, 0.5)
+    compare(place, levels((2, 2, 16)), 20, [0.5])
 
 
 def test_points_that_need_no_gradient_get_none() -> None:
     own = leaves(tensors_of(levels((4, 3, 16))), torch.float32)
     given = points(20)
     to_cube = planes._to_cube(BOX).tolist()
-    grids.lookup(given, torch.zeros(20, 0), 0.1, to_cube, own).sum().backward()
+    grids.lookup(given, torch.zeros(20, 0), [0.1], to_cube, own).sum().backward()
     assert given.grad is None
     assert own[0].grad is not None and own[0].grad.any()
 
@@ -141,14 +152,14 @@ def test_points_that_need_no_gradient_get_none() -> None:
 @halves
 @pytest.mark.parametrize("time", [-1.0, -0.37, 0.2, 1.4])
 def test_half_precision(place: str, time: float, dtype: torch.dtype) -> None:
-    compare(place, levels((4, 3, 32), (9, 5, 16)), 300, time, beside=3, dtype=dtype)
+    compare(place, levels((4, 3, 32), (9, 5, 16)), 300, [time, 0.5], beside=3, dtype=dtype)
 
 
 @halves
 def test_half_precision_is_used_where_it_is_chosen(dtype: torch.dtype) -> None:
     """What rounding does to features is twice what the tests above allow, or more."""
     some = levels((4, 3, 32), (9, 5, 16))
-    given = points(300), torch.zeros(300, 0), 0.2, planes._to_cube(BOX).tolist(), tensors_of(some)
+    given = points(300), torch.zeros(300, 0), [0.2], planes._to_cube(BOX).tolist(), tensors_of(some)
     whole = grids.lookup(*given)
     with precision.computing_in({torch.bfloat16: "bf16", torch.float16: "fp16"}[dtype]):
         halved = planes.lookup(some, given[0], 0.2, BOX)
@@ -161,7 +172,7 @@ def test_half_precision_is_used_where_it_is_chosen(dtype: torch.dtype) -> None:
 def test_tiny_gradients_reach_grids_of_half_precision() -> None:
     for dtype in HALVES:
         some = [tensor.requires_grad_() for tensor in tensors_of(levels((4, 3, 16)))]
-        given = points(20), torch.zeros(20, 0), 0.2, planes._to_cube(BOX).tolist(), some
+        given = points(20), torch.zeros(20, 0), [0.2], planes._to_cube(BOX).tolist(), some
         features = grids.lookup(*given, dtype)
         slope = torch.rand(features.shape, generator=generator(5))
         whole, tiny = (torch.autograd.grad(features, some, slope * by, retain_graph=True)
@@ -212,7 +223,13 @@ def run(name: str, nodes: Tensor, values: Tensor, write: int) -> None:
 def test_too_many_levels_are_refused() -> None:
     many = tensors_of(levels(*[(2, 2, 16)] * (MOST_LEVELS + 1)))
     with pytest.raises(ValueError, match="at most 8"):
-        grids.lookup(points(2), torch.zeros(2, 0), 0.0, planes._to_cube(BOX).tolist(), many)
+        grids.lookup(points(2), torch.zeros(2, 0), [0.0], planes._to_cube(BOX).tolist(), many)
+
+
+def test_too_many_times_are_refused() -> None:
+    given = points(2), torch.zeros(2, 0), [0.0] * (MOST_VIEWS + 1)
+    with pytest.raises(ValueError, match="17 times; at most 16"):
+        grids.lookup(*given, planes._to_cube(BOX).tolist(), tensors_of(levels((2, 2, 16))))
 
 
 @pytest.mark.parametrize("shapes", [[(2, 2, 16)], [(5, 3, 32)], [(4, 7, 16), (9, 4, 16)]])

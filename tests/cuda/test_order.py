@@ -65,7 +65,7 @@ def looking_up(dtype: torch.dtype) -> list[Tensor]:
     levels = [planes.new_level(r, 4, 16, rng) for r in (3, 8)]
     tensors = [tensor.requires_grad_() for level in levels for tensor in level]
     points = torch.randn(100, 3, generator=rng).requires_grad_()
-    given = points, torch.ones(100, 2), 0.3, [[1.0] * 3, [0.0] * 3], tensors
+    given = points, torch.ones(100, 2), [0.3, -0.5], [[1.0] * 3, [0.0] * 3], tensors
     features = grids.lookup(*given, dtype)
     value = grids.penalty((0.1, 0.2, 0.3), tensors)
     total = features.square().sum() + value

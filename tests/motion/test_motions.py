@@ -18,7 +18,7 @@ from gsdmsr_cli import motion as motions
 from gsdmsr_cli import plugins
 from gsdmsr_cli.errors import UsageError
 from gsdmsr_cli.fields.planes import CUBE
-from gsdmsr_cli.motion import Motion, start_motion
+from gsdmsr_cli.motion import Motion, MovingAtOnce, start_motion
 from gsdmsr_cli.preset import OptimizerOptions
 from gsdmsr_cli.splats import Splats
 
@@ -64,6 +64,20 @@ def test_starts_as_the_identity(name: str) -> None:
         motion.advance(progress)
         for time in TIMES:
             assert_equal(motion.at(splats, time), splats)
+
+
+@every_motion
+def test_several_times_at_once_are_those_times_to_the_last_bit(name: str) -> None:
+    motion, splats = disturbed(started(name, COUNT)), splats_of(COUNT)
+    if not isinstance(motion, MovingAtOnce):
+        pytest.skip("moves to one time after the other")
+    for progress in (0.0, 1.0):
+        motion.advance(progress)
+        found = motion.at_times(splats, TIMES)
+        for time, moved in zip(TIMES, found, strict=True):
+            assert_equal(moved, motion.at(splats, time))
+    motion.take(torch.arange(0))
+    assert [len(moved) for moved in motion.at_times(splats_of(0), TIMES)] == [0, 0, 0]
 
 
 @every_motion
