@@ -19,12 +19,14 @@ from datasets import noise, write_picture
 from gsdmsr_cli import cli, files, imaging
 from gsdmsr_cli import run as runs
 from gsdmsr_cli.commands import train as train_command
+from gsdmsr_cli.commands._trained import open_trained
 from gsdmsr_cli.errors import DataError, UsageError
 from gsdmsr_cli.formats import read_scene
 from gsdmsr_cli.pictures import Pictures
 from gsdmsr_cli.preset import load_preset
 from gsdmsr_cli.raster import best_engine
 from gsdmsr_cli.run import Run, continue_run, create_run, open_run, refuse_used
+from gsdmsr_cli.splatting import draw
 from gsdmsr_cli.training.trainer import Trainer
 
 Gsdmsr = Callable[..., int]
@@ -101,6 +103,27 @@ def test_half_precision_is_refused_where_no_gpu_is_found(
     said = one_line(capsys)
     assert "is fp16; allowed on the CPU: float32; --device auto takes the CPU, since torch" in said
     assert not out.exists()
+
+
+def test_a_run_of_half_precision_is_drawn_on_the_cpu_but_not_trained_there(
+    gsdmsr: Gsdmsr, tiny_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any
+) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    options = "splats.count=20", "splats.start=box", "training.precision=bf16"
+    scene, preset = read_scene(tiny_scene), load_preset("dnerf", None, options)
+    trainer = Trainer(scene, preset, best_engine("cpu"), Pictures((1.0, 1.0, 1.0), 1, 1 << 28))
+    made = create_run(tmp_path / "run", "dnerf", preset, trainer.facts, scene)
+    made.save(trainer.checkpoint())
+    before = {path: path.read_bytes() for path in made.root.iterdir()}
+    assert gsdmsr("train", "--data", tiny_scene, "--out", made.root, "--resume") == 2
+    assert "training.precision is bf16; allowed on the CPU: float32" in one_line(capsys)
+    assert {path: path.read_bytes() for path in made.root.iterdir()} == before
+    studio = open_trained(made.root, None).studio
+    trainer.restore(made.load())
+    assert studio.model.precision == trainer.model.precision == "bf16"
+    view = scene.split("test")[0]
+    frame = draw(studio.model, view.camera, view.time, studio.engine, studio.background)
+    assert frame.rgb.isfinite().all()
 
 
 def test_a_scalar_in_a_file_is_not_lost_under_an_override(tmp_path: Path) -> None:
