@@ -126,7 +126,7 @@ class TrainingOptions:
 
     steps: int = 10000
     budget: str | None = None
-    static_until: float = 0.005
+    static_until: float = 0.01
     views_per_step: int = 2
     tiles_per_view: int = 0
     low_resolution_until: float = 0.3

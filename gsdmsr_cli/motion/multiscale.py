@@ -60,7 +60,7 @@ class Options:
     coarse_level: int = 16
     coarse_channels: int = 16
     coarse_time_ratio: float = 0.125
-    coarse_until: float = 0.02
+    coarse_until: float = 0.06
     levels: tuple[int, ...] = (16, 32)
     channels: int = 16
     time_ratio: float = 0.2
