@@ -114,8 +114,7 @@ class TrainingOptions:
         views_per_step: pictures drawn and compared per step.
         tiles_per_view: tiles of 16 x 16 px that are chosen of each, once SSIM does not count any
             more; 0 is all.
-        low_resolution_until: progress up to which pictures of half the size are drawn, for those
-            of 400 px a side or less; twice it for those of 800 px and more; 0 is never.
+        low_resolution_until: progress up to which pictures of half the size are drawn; 0 is never.
         average_from: progress from which the result is the mean of the steps' values; 1 is never.
         checkpoint_minutes: time between checkpoints [min].
         seed: seed of every random choice.

@@ -20,13 +20,6 @@ from gsdmsr_cli.splats import Splats
 from gsdmsr_cli.splatting_constants import tile_grid
 from gsdmsr_cli.training.losses import photometric_loss, tile_errors
 
-LOW_RESOLUTION_SIDE = 400
-"""Larger pictures are drawn small for longer, up to twice as long at twice the side [px].
-
-A step on pictures of 800 px takes four times that on 400 px, and small ones of 400 px still teach
-much; what 200 px teach is learned sooner (docs/method.md).
-"""
-
 
 class Stage(NamedTuple):
     """How far a training has come, for whoever looks at a view.
@@ -99,11 +92,10 @@ class Observer:
         Raises:
             DataError: a view's picture cannot be read.
         """
-        sources = [self._pictures(view, stage.progress) for view in views]
-        pairs = list(zip(sources, views, strict=True))
-        cameras = [pictures.camera(view) for pictures, view in pairs]
-        targets = [self._resident.load(pictures, view) for pictures, view in pairs]
-        masks = [pictures.counted(view) for pictures, view in pairs]
+        pictures = self._pictures(stage.progress)
+        cameras = [pictures.camera(view) for view in views]
+        targets = [self._resident.load(pictures, view) for view in views]
+        masks = [pictures.counted(view) for view in views]
         times = [view.time for view in views]
         weights = [None if own is None else own.to(self.background.device) for own in tile_weights]
         further = self._ssim_weight(stage.progress), self._sh_degree(stage.progress)
@@ -132,14 +124,12 @@ class Observer:
         """Return how many tiles a view's picture has, or 0 where they may not be chosen."""
         if self._ssim_weight(progress) > 0:
             return 0
-        camera = self._pictures(view, progress).camera(view)
+        camera = self._pictures(progress).camera(view)
         return math.prod(tile_grid(camera.width, camera.height))
 
-    def _pictures(self, view: View, progress: float) -> Pictures | HalvedPictures:
-        camera = self.pictures.camera(view)
-        longer = math.sqrt(camera.width * camera.height) / LOW_RESOLUTION_SIDE
-        until = self.preset.training.low_resolution_until * min(max(longer, 1.0), 2.0)
-        return self._halved if progress < until else self.pictures
+    def _pictures(self, progress: float) -> Pictures | HalvedPictures:
+        low = progress < self.preset.training.low_resolution_until
+        return self._halved if low else self.pictures
 
     def _ssim_weight(self, progress: float) -> float:
         losses = self.preset.losses

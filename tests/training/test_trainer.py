@@ -288,18 +288,6 @@ def test_pictures_are_small_at_first_where_asked_for(tiny_scene: Path) -> None:
     assert witness.sizes == [(12, 12)] * (STEPS // 2) + [(24, 24)] * (STEPS // 2)
 
 
-@pytest.mark.parametrize(("side", "until"), [(24, 0.25), (8, 0.5), (16, 0.375), (4, 0.5)])
-def test_large_pictures_are_small_for_longer(
-    tiny_scene: Path, monkeypatch: pytest.MonkeyPatch, side: int, until: float
-) -> None:
-    """Pictures of 24 px, in units of the side up to which the option says all."""
-    monkeypatch.setattr(look, "LOW_RESOLUTION_SIDE", side)
-    witness = Witness()
-    preset = preset_of("training.low_resolution_until=0.25", "data.downscale=2")
-    after(trainer_of(tiny_scene, preset, witness), STEPS)
-    assert witness.sizes.index((24, 24)) == round(until * STEPS)
-
-
 def test_ssim_counts_up_to_its_end(tiny_scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     weights, true = [], look.photometric_loss
 
