@@ -111,6 +111,7 @@ class TrainingOptions:
         steps: length of the training [steps], unless there is a budget.
         budget: length of the training as wall time, such as "8m"; null counts steps.
         static_until: progress up to which nothing moves.
+        static_steps: most steps for which nothing moves.
         views_per_step: pictures drawn and compared per step.
         tiles_per_view: tiles of 16 x 16 px that are chosen of each, once SSIM does not count any
             more; 0 is all.
@@ -125,7 +126,8 @@ class TrainingOptions:
 
     steps: int = 10000
     budget: str | None = None
-    static_until: float = 0.01
+    static_until: float = 0.04
+    static_steps: int = 300
     views_per_step: int = 2
     tiles_per_view: int = 0
     low_resolution_until: float = 0.3
@@ -142,7 +144,7 @@ class TrainingOptions:
         _require_progress(self, "static_until", "low_resolution_until", "average_from")
         _require_positive(self, "checkpoint_minutes")
         require(self, "seed", 0 <= self.seed < 2**32, "0 to 4294967295")
-        _require_at_least(self, 0, "threads", "tiles_per_view")
+        _require_at_least(self, 0, "static_steps", "threads", "tiles_per_view")
 
 
 @dataclass(frozen=True)

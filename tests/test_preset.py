@@ -207,6 +207,7 @@ def test_a_malformed_override_is_refused(override: str) -> None:
         "training.budget=1:30",
         "training.budget=0m",
         "training.static_until=-0.1",
+        "training.static_steps=-1",
         "training.low_resolution_until=2",
         "training.views_per_step=0",
         "training.checkpoint_minutes=0",

@@ -190,14 +190,16 @@ class Trainer:
 
     def _enter_phase(self, progress: float) -> None:
         """Start the motion after the static phase, without the momentum of what did not move."""
-        if not self._moving and progress >= self.preset.training.static_until:
+        options = self.preset.training
+        over = progress >= options.static_until or self.clock.step >= options.static_steps
+        if over and not self._moving:
             self._moving = True
             for name in STORED:
                 self.optimizer.forget(name, second=False)
         self.model.motion.advance(progress)
 
     def _rates(self, progress: float) -> dict[str, float]:
-        """Return each tensor's learning rate; schedules begin when the motion does."""
+        """Return each tensor's learning rate; schedules begin at ``static_until``."""
         options = self.preset.optimizer
         static = self.preset.training.static_until
         p = (progress - static) / (1 - static) if static < 1 else 0.0

@@ -160,6 +160,18 @@ def test_nothing_moves_in_the_static_phase(tiny_scene: Path, motion: str) -> Non
     assert not torch.equal(*moved)
 
 
+@pytest.mark.parametrize(("steps", "first"), [(3, 3), (300, 10), (0, 0)])
+def test_the_static_phase_ends_by_progress_or_by_steps(
+    tiny_scene: Path, steps: int, first: int
+) -> None:
+    options = ["training.static_until=0.25", f"training.static_steps={steps}"]
+    trainer, moving = trainer_of(tiny_scene, preset_of(*options)), []
+    for _ in range(12):
+        trainer.step()
+        moving.append(trainer.checkpoint().state["moving"])
+    assert moving.index(True) == first
+
+
 def test_the_motion_starts_without_the_momentum_of_the_static_phase(tiny_scene: Path) -> None:
     options = ["training.static_until=0.25", "density.start=999"]
     trainer = trainer_of(tiny_scene, preset_of(*options))
