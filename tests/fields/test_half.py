@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
-
 import pytest
 import torch
 from kernel_checks import assert_near, generator, leaves
 from motion_checks import disturbed, splats_of, started
+from network_checks import layers_of, tensors_of
 from torch import Tensor
 
 from gsdmsr_cli.fields import half, precision
@@ -18,19 +17,6 @@ HALVES = pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16], ids=s
 
 BACKWARD = torch.finfo(torch.bfloat16).eps
 """Twice the largest error of rounding a gradient, which is rounded once or twice per layer."""
-
-
-def tensors_of(widths: list[int]) -> list[Tensor]:
-    """Return weight and bias of each layer, all random."""
-    rng, tensors = generator(), []
-    for inputs, outputs in pairwise(widths):
-        tensors.append(torch.randn(inputs, outputs, generator=rng) / inputs**0.5)
-        tensors.append(torch.randn(outputs, generator=rng) * 0.3)
-    return tensors
-
-
-def layers_of(tensors: list[Tensor]) -> list[Layer]:
-    return [Layer(*pair) for pair in zip(tensors[::2], tensors[1::2], strict=True)]
 
 
 def rounded(x: Tensor, dtype: torch.dtype) -> Tensor:

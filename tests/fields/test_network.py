@@ -3,30 +3,16 @@
 from __future__ import annotations
 
 import math
-from itertools import pairwise
 
 import pytest
 import torch
 from kernel_checks import assert_near, assert_same_on_threads, generator, leaves
+from network_checks import layers_of, tensors_of
 from torch import Tensor
 
 from gsdmsr_cli.fields import network
-from gsdmsr_cli.fields.network import Layer
 
 WIDTHS = [[48, 64, 64, 10], [16, 3], [32, 16, 16], [16, 80, 33]]
-
-
-def tensors_of(widths: list[int], seed: int = 0) -> list[Tensor]:
-    """Return weight and bias of each layer, all random."""
-    rng, tensors = generator(seed), []
-    for inputs, outputs in pairwise(widths):
-        tensors.append(torch.randn(inputs, outputs, generator=rng) / inputs**0.5)
-        tensors.append(torch.randn(outputs, generator=rng) * 0.3)
-    return tensors
-
-
-def layers_of(tensors: list[Tensor]) -> list[Layer]:
-    return [Layer(*pair) for pair in zip(tensors[::2], tensors[1::2], strict=True)]
 
 
 def test_twin_passes_gradcheck() -> None:
