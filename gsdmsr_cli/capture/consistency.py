@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from gsdmsr_cli.capture.colmap import DATABASE
 from gsdmsr_cli.capture.reconstruction import Reconstruction
+from gsdmsr_cli.capture.verified import shared_pixels
 from gsdmsr_cli.lens import Lens
 from gsdmsr_cli.native import load_pycolmap
 
@@ -48,7 +49,7 @@ def moving_share(matches: Path, found: Reconstruction) -> float:
         found: the cameras.
     """
     total = off = 0
-    limit = max(OFF * max(found.lens.width, found.lens.height), LEAST_OFF)
+    limit = _limit(found.lens)
     with load_pycolmap().Database.open(matches / DATABASE) as database:
         images = {image.name: image.image_id for image in database.read_all_images()}
         ids = [images[name] for name in found.names]
@@ -80,10 +81,8 @@ def turning_share(matches: Path, lens: Lens) -> float:
     """
     pairs = _farthest_matches(matches)
     total = sum(len(one) for one, _ in pairs)
-    centre, side = np.array([lens.cx, lens.cy]), max(lens.width, lens.height)
-    limit = max(OFF * side, LEAST_OFF)
-    best = 0
-    for focal in side * FOCALS:
+    centre, limit, best = np.array([lens.cx, lens.cy]), _limit(lens), 0
+    for focal in max(lens.width, lens.height) * FOCALS:
         explained = 0
         for pixels in pairs:
             one, other = (np.c_[(p - centre) / focal, np.ones(len(p))] for p in pixels)
@@ -96,6 +95,11 @@ def turning_share(matches: Path, lens: Lens) -> float:
     return best / max(total, 1)
 
 
+def _limit(lens: Lens) -> float:
+    """Return how far a match may lie from where it should [px]."""
+    return max(OFF * max(lens.width, lens.height), LEAST_OFF)
+
+
 def _farthest_matches(matches: Path) -> list[tuple[Floats, Floats]]:
     """Return the (N, 2) pixels that each frame shares with the farthest one it matches."""
     found = []
@@ -105,11 +109,10 @@ def _farthest_matches(matches: Path) -> list[tuple[Floats, Floats]]:
         pixels = {i: database.read_keypoints(i)[:, :2].astype(np.float64) for i in ids}
         for k, first in enumerate(ids):
             for second in reversed(ids[k + 1 :]):
-                if database.exists_two_view_geometry(first, second):
-                    inliers = database.read_two_view_geometry(first, second).inlier_matches
-                    if len(inliers):
-                        found.append((pixels[first][inliers[:, 0]], pixels[second][inliers[:, 1]]))
-                        break
+                shared = shared_pixels(database, pixels, first, second)
+                if shared is not None:
+                    found.append(shared)
+                    break
     return found
 
 

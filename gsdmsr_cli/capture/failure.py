@@ -7,6 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from gsdmsr_cli.capture.verified import shared_pixels
+
 FEW_FEATURES = 60
 """Frames with fewer features, in the median, show too little."""
 
@@ -26,12 +28,10 @@ def why_no_model(colmap: Any, database: Path) -> str:
         shifts = []
         for k, first in enumerate(images):
             for second in images[k + 1 :]:
-                ids = first.image_id, second.image_id
-                if opened.exists_two_view_geometry(*ids):
-                    inliers = opened.read_two_view_geometry(*ids).inlier_matches
-                    if len(inliers):
-                        moved = pixels[ids[1]][inliers[:, 1]] - pixels[ids[0]][inliers[:, 0]]
-                        shifts.append(float(np.median(np.linalg.norm(moved, axis=1))))
+                shared = shared_pixels(opened, pixels, first.image_id, second.image_id)
+                if shared is not None:
+                    moved = shared[1] - shared[0]
+                    shifts.append(float(np.median(np.linalg.norm(moved, axis=1))))
     median = int(np.median([len(found) for found in pixels.values()]))
     if median < FEW_FEATURES:
         return (
