@@ -49,6 +49,7 @@ class Options:
         width: width of the decoder's two hidden layers, a multiple of 16.
         pyramid: give the coarse features to the fine decoder as well.
         embedding: features of its own that each splat has, a multiple of 16; 0 as in the method.
+        embedding_weight: weight of the mean square of those features.
         detach: keep the fields' gradient from the canonical positions.
         offset_weight: weight of the mean squared coarse offset, in units of the bound.
         smooth_weight: weight of the mean squared difference of what the decoder says at a splat's
@@ -67,6 +68,7 @@ class Options:
     width: int = 32
     pyramid: bool = True
     embedding: int = 16
+    embedding_weight: float = 0.0
     detach: bool = False
     offset_weight: float = 1e-3
     smooth_weight: float = 0.0
@@ -151,7 +153,11 @@ class MultiscaleMotion:
         self.fine_active = progress >= self.options.coarse_until
 
     def penalty(self, splats: Splats, time: float, generator: torch.Generator) -> Tensor | None:
-        """Return the plane regularisers of the active grids, L_reg and L_smooth."""
+        """Return the plane regularisers of the active grids, L_reg and L_smooth.
+
+        And that of the splats' own features: what moves one splat unlike those around it was seen
+        at few times from few sides, and the less of it there is, the better are other views met.
+        """
         o = self.options
         levels = self.coarse + self.fine if self.fine_active else self.coarse
         value = planes.penalty(levels, o.space_smoothness, o.time_smoothness, o.time_stillness)
@@ -159,6 +165,8 @@ class MultiscaleMotion:
             features = self._features(self.coarse, splats, [time])
             offset = network.apply_network(self.coarse_decoder, features) / self.facts.bound
             value = value + o.offset_weight * offset.square().sum(dim=1).mean()
+        if o.embedding and o.embedding_weight > 0 and self.fine_active:
+            value = value + o.embedding_weight * self.embeddings.square().mean()
         if o.smooth_weight > 0 and self.fine_active:
             value = value + o.smooth_weight * self._roughness(splats, time, generator)
         return value

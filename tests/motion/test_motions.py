@@ -239,6 +239,19 @@ def test_multiscale_regularises_the_coarse_offset() -> None:
     torch.testing.assert_close(penalty, expected, rtol=1e-4, atol=1e-9)
 
 
+@pytest.mark.parametrize("fine", [False, True])
+def test_multiscale_keeps_the_splats_own_features_small(fine: bool) -> None:
+    """By the mean square of all of them, once there is something that reads them."""
+    weights = {"space_smoothness": 0.0, "time_smoothness": 0.0, "time_stillness": 0.0}
+    motion = disturbed(started("multiscale", offset_weight=0.0, embedding_weight=3.0, **weights))
+    motion.advance(1.0 if fine else 0.0)
+    penalty = motion.penalty(splats_of(COUNT), 0.6, generator())
+    assert penalty is not None
+    expected = 3.0 * motion.tensors()["embeddings"].square().mean() if fine else torch.zeros(())
+    assert not fine or expected > 0
+    torch.testing.assert_close(penalty, expected)
+
+
 def test_multiscale_without_the_pyramid_gives_the_decoder_fewer_inputs() -> None:
     inputs = [
         started("multiscale", pyramid=pyramid).tensors()["decoder.0.weight"].shape[0]
