@@ -226,11 +226,13 @@ def test_multiscale_moves_positions_only_while_coarse() -> None:
         assert not torch.equal(fine.tensors()[name], coarse.tensors()[name]), name
 
 
+NO_PLANE_TERMS = {"space_smoothness": 0.0, "time_smoothness": 0.0, "time_stillness": 0.0}
+
+
 def test_multiscale_regularises_the_coarse_offset() -> None:
     """L_reg is the mean squared offset in units of the bound."""
     splats = splats_of(COUNT)
-    weights = {"space_smoothness": 0.0, "time_smoothness": 0.0, "time_stillness": 0.0}
-    motion = disturbed(started("multiscale", offset_weight=2.0, coarse_until=1.0, **weights))
+    motion = disturbed(started("multiscale", offset_weight=2.0, coarse_until=1.0, **NO_PLANE_TERMS))
     motion.advance(0.0)
     offset = motion.at(splats, 0.6).means - splats.means
     penalty = motion.penalty(splats, 0.6, generator())
@@ -242,8 +244,8 @@ def test_multiscale_regularises_the_coarse_offset() -> None:
 @pytest.mark.parametrize("fine", [False, True])
 def test_multiscale_keeps_the_splats_own_features_small(fine: bool) -> None:
     """By the mean square of all of them, once there is something that reads them."""
-    weights = {"space_smoothness": 0.0, "time_smoothness": 0.0, "time_stillness": 0.0}
-    motion = disturbed(started("multiscale", offset_weight=0.0, embedding_weight=3.0, **weights))
+    weights = {"offset_weight": 0.0, "embedding_weight": 3.0, **NO_PLANE_TERMS}
+    motion = disturbed(started("multiscale", **weights))
     motion.advance(1.0 if fine else 0.0)
     penalty = motion.penalty(splats_of(COUNT), 0.6, generator())
     assert penalty is not None
