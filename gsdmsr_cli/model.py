@@ -13,7 +13,7 @@ from torch.autograd.function import once_differentiable
 
 from gsdmsr_cli.errors import DataError
 from gsdmsr_cli.fields.precision import computing_in
-from gsdmsr_cli.motion import Facts, Motion, MovingAtOnce, start_motion
+from gsdmsr_cli.motion import Facts, Motion, MovingAtOnce, Rooted, start_motion
 from gsdmsr_cli.splats import NAMES, Splats
 
 STORED_AS = "splats."
@@ -110,6 +110,14 @@ class Model:
         if not moves[:moving].all():
             raise ValueError("rows of splats that move come after rows of splats that stand still")
         self._resize(rows, moving)
+
+    @torch.no_grad()
+    def root(self) -> list[str]:
+        """Tie the motion to the splats that move now; return the names of what that has changed."""
+        if not isinstance(self.motion, Rooted) or not self.moving:
+            return []
+        moving = self.splats.map(lambda tensor: tensor[: self.moving])
+        return [MOVED_BY + name for name in self.motion.root(moving)]
 
     def become(self, count: int, moving: int) -> None:
         """Take the shapes of a model of so many splats; all values must then be set anew."""

@@ -6,6 +6,7 @@ from typing import Any
 
 import torch
 from kernel_checks import generator
+from torch import Tensor
 
 from gsdmsr_cli.motion import Facts, Motion, start_motion
 from gsdmsr_cli.splats import Splats
@@ -38,3 +39,8 @@ def disturbed(motion: Motion) -> Motion:
         for tensor in motion.tensors().values():
             tensor += 0.1 * torch.randn(tensor.shape, generator=rng)
     return motion
+
+
+def are_among(points: Tensor, others: Tensor) -> bool:
+    """Tell whether every point (N, 3) is one of the others, to the last bit."""
+    return set(map(tuple, points.tolist())) <= set(map(tuple, others.tolist()))

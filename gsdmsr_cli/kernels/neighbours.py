@@ -43,6 +43,12 @@ def mean_squares(points: NDArray[np.float64], count: int) -> NDArray[np.float64]
     return found
 
 
+def near_order(points: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Return the rows of points (N, 3), (N,), in an order that keeps neighbours together."""
+    slots = _build(points).slots
+    return slots[slots < len(points)]
+
+
 def _build(points: NDArray[np.float64]) -> _Tree:
     """Halve all nodes of a level at once, across the axis along which each is longest."""
     levels = max(0, int(np.ceil(np.log2(len(points) / LEAF))))

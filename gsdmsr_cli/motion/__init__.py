@@ -65,6 +65,20 @@ class Motion(Protocol):
 
 
 @runtime_checkable
+class Rooted(Motion, Protocol):
+    """A motion that is tied to where the canonical splats are."""
+
+    def root(self, splats: Splats) -> Sequence[str]:
+        """Tie the motion anew to the splats, of which there are others than before.
+
+        Called without a graph as motion begins and after splats were grown. Shapes stay.
+
+        Returns:
+            the names of its tensors that have new values.
+        """
+
+
+@runtime_checkable
 class MovingAtOnce(Motion, Protocol):
     """A motion that moves splats to several times with less work than one after the other."""
 

@@ -196,6 +196,7 @@ class Trainer:
             self._moving = True
             for name in STORED:
                 self.optimizer.forget(name, second=False)
+            self._root()
         self.model.motion.advance(progress)
 
     def _rates(self, progress: float) -> dict[str, float]:
@@ -274,12 +275,19 @@ class Trainer:
             self._follow(rows, fresh)
             if fresh.any():
                 self.average.forget()
+                self._root()
         if self._resets < len(options.reset_at) and progress >= options.reset_at[self._resets]:
             self._resets += 1
             reset_opacities(self.model.splats)
             self.optimizer.forget(STORED_AS + "logit_opacities")
             self.average.forget()
             self.saliency.pardon(torch.ones_like(self.saliency.high))
+
+    def _root(self) -> None:
+        """Tie the motion to the present splats, if it moves them and cares where they are."""
+        if self._moving:
+            for name in self.model.root():
+                self.optimizer.forget(name)
 
     def _density_is_due(self, progress: float) -> bool:
         """Tell whether to grow and prune, or only to prune, after this step."""

@@ -11,14 +11,14 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from kernel_checks import generator
-from motion_checks import FACTS, disturbed, splats_of, started
+from motion_checks import FACTS, are_among, disturbed, splats_of, started
 from torch import Tensor
 
 from gsdmsr_cli import motion as motions
 from gsdmsr_cli import plugins
 from gsdmsr_cli.errors import UsageError
 from gsdmsr_cli.fields.planes import CUBE
-from gsdmsr_cli.motion import Motion, MovingAtOnce, start_motion
+from gsdmsr_cli.motion import Motion, MovingAtOnce, Rooted, start_motion
 from gsdmsr_cli.preset import OptimizerOptions
 from gsdmsr_cli.splats import Splats
 
@@ -26,7 +26,7 @@ TIMES = (0.0, 0.3, 1.0)
 COUNT = 7
 
 every_motion = pytest.mark.parametrize("name", plugins.names(motions.__name__))
-every_grid = pytest.mark.parametrize("name", ["hexplane", "multiscale"])
+every_grid = pytest.mark.parametrize("name", ["hexplane", "multiscale", "nodes"])
 
 
 def assert_equal(found: Splats, expected: Splats, **tolerance: float) -> None:
@@ -53,7 +53,7 @@ def weighted_sum(splats: Splats) -> Tensor:
 
 
 def test_the_known_motions_are_found() -> None:
-    assert {"static", "hexplane", "multiscale"} <= set(plugins.names(motions.__name__))
+    assert {"static", "hexplane", "multiscale", "nodes"} <= set(plugins.names(motions.__name__))
 
 
 @every_motion
@@ -182,7 +182,7 @@ def test_time_is_mapped_over_the_whole_grid(name: str, time: float) -> None:
         assert read[end] and int(read.sum()) == 1, what
 
 
-@every_grid
+@pytest.mark.parametrize("name", ["hexplane", "multiscale"])
 def test_detach_keeps_the_field_out_of_the_positions_gradient(name: str) -> None:
     splats = splats_of(COUNT).map(torch.nn.Parameter)
     motion = disturbed(started(name, detach=True))
@@ -276,3 +276,54 @@ def test_the_time_grid_follows_from_the_frames(frames: int, nodes: int) -> None:
     facts = motions.Facts(1.0, CUBE, frames)
     motion = start_motion({"name": "hexplane"}, facts, 1, generator())
     assert motion.tensors()["grid.0.time"].shape[2] == nodes
+
+
+def nodes_of(splats: int, **options: int) -> Motion:
+    return start_motion({"name": "nodes", **options}, FACTS, splats, generator())
+
+
+def test_nodes_are_rooted_in_splats_that_show_and_all_goes_on_nearly_as_before() -> None:
+    splats = splats_of(3000)
+    splats.logit_opacities[:1000] = -9.0
+    splats.means[:1000] += 5.0
+    motion = disturbed(nodes_of(3000, count=600))
+    before = motion.at(splats, 0.4)
+    assert isinstance(motion, Rooted)
+    with torch.no_grad():
+        assert set(motion.root(splats)) == {"nodes", "log_radii"}
+    assert are_among(motion.tensors()["nodes"], splats.means[1000:])
+    after = motion.at(splats, 0.4)
+    moved = (after.means - splats.means)[1000:].norm(dim=1).mean()
+    jumped = (after.means - before.means)[1000:].norm(dim=1).mean()
+    assert float(jumped.detach()) < 0.5 * float(moved.detach())
+
+
+def test_nodes_root_where_splats_are_if_too_few_of_them_show() -> None:
+    splats, motion = splats_of(20), nodes_of(20, count=30)
+    splats.logit_opacities.fill_(-9.0)
+    assert isinstance(motion, Rooted)
+    with torch.no_grad():
+        motion.root(splats)
+    assert are_among(motion.tensors()["nodes"], splats.means)
+
+
+@torch.no_grad()
+def test_nodes_follow_splats_that_have_changed_since() -> None:
+    """What is kept of one drawing for the next must not outlive the splats it was found for."""
+    splats, motion = splats_of(COUNT), disturbed(started("nodes"))
+    motion.at(splats, 0.3)
+    others = splats_of(COUNT, seed=1)
+    expected = disturbed(started("nodes")).at(others, 0.3)
+    assert_equal(motion.at(others, 0.3), expected)
+    splats.means.copy_(others.means)
+    motion.advance(1.0)
+    assert torch.equal(motion.at(splats, 0.3).means, expected.means)
+
+
+@pytest.mark.parametrize(
+    ("options", "found"),
+    [({"count": 3}, "count is 3; allowed: 4 or more"), ({"neighbours": 2000}, "1 to count")],
+)
+def test_nodes_refuse_numbers_out_of_range(options: dict[str, int], found: str) -> None:
+    with pytest.raises(UsageError, match=found):
+        nodes_of(1, **options)

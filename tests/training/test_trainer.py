@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
 from kernel_checks import assert_same_on_threads
+from motion_checks import are_among
 from torch import Tensor
 from training_checks import (
     SETTLING,
@@ -188,6 +190,34 @@ def test_the_motion_starts_without_the_momentum_of_the_static_phase(tiny_scene: 
     after(trainer, 3)
     # the second moments, which say how large a step may be, stay
     assert forgotten == [(f"splats.{name}", False) for name in SPLATS]
+
+
+def test_a_motion_is_rooted_as_it_begins_and_after_every_growth(tiny_scene: Path) -> None:
+    options = ["training.static_until=0.25", "density.gradient=1e-9", "density.reset_at=[]"]
+    trainer = trainer_of(tiny_scene, preset_of(*options, motion="nodes"))
+    rooted: list[tuple[int, int]] = []
+    root = trainer.model.root
+
+    def remember() -> list[str]:
+        names = root()
+        nodes = trainer.model.tensors()["motion.nodes"]
+        means = trainer.model.splats.means
+        assert are_among(nodes, means)
+        rooted.append((trainer.clock.step, len(means)))
+        return names
+
+    trainer.model.root = remember  # type: ignore[method-assign]
+    counts = []
+    for step in range(STEPS):
+        counts.append(len(trainer.model.splats))
+        trainer.step()
+        if (step + 1, len(trainer.model.splats)) in rooted:
+            for moments in (trainer.optimizer.first, trainer.optimizer.second):
+                assert not moments["motion.nodes"].any()
+    grown = [(step, n) for step, (o, n) in enumerate(pairwise(counts), start=1) if n > o]
+    first = STEPS // 4
+    assert rooted[0] == (first, counts[first])
+    assert len(rooted) > 1 and rooted[1:] == [(step, n) for step, n in grown if step > first]
 
 
 @pytest.mark.parametrize(("steps", "every"), [(40, 1), (40, 2), (120, 2), (40, 5)])

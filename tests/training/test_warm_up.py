@@ -48,7 +48,7 @@ print(json.dumps(stages))
 """
 
 
-@pytest.mark.parametrize("motion", ["multiscale", "hexplane"])
+@pytest.mark.parametrize("motion", ["multiscale", "hexplane", "nodes"])
 def test_training_needs_no_kernel_that_was_not_warmed_up(tiny_scene: Path, motion: str) -> None:
     options = json.dumps([*OPTIONS, f"motion={{name: {motion}}}"])
     command = [sys.executable, "-c", IN_A_NEW_PROCESS, str(tiny_scene), options, str(STEPS)]

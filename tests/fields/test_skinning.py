@@ -1,0 +1,161 @@
+"""Splats that follow nodes: the twin by hand, the kernels against the twin and against SciPy."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from kernel_checks import assert_near, assert_same_on_threads, generator, leaves
+from motion_checks import splats_of
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from gsdmsr_cli.fields.deformation import OUTPUTS
+from gsdmsr_cli.fields.skinning import (
+    nearest_nodes,
+    skin,
+    skin_twin,
+    spacing,
+    spread_nodes,
+    transforms,
+)
+from gsdmsr_cli.geometry import quat_to_rotmat
+from gsdmsr_cli.splats import Splats
+
+
+def nodes_of(count: int, seed: int = 3) -> list[Tensor]:
+    """Return places, log radii and deformations of nodes."""
+    rng = generator(seed)
+    places = torch.randn(count, 3, generator=rng)
+    radii = 0.3 * torch.randn(count, generator=rng) - 1
+    return [places, radii, 0.3 * torch.randn(count, OUTPUTS, generator=rng)]
+
+
+def guesses(count: int, kept: int) -> Tensor:
+    return torch.zeros(count, kept, dtype=torch.int32)
+
+
+@pytest.mark.parametrize("move", [skin, skin_twin])
+def test_one_node_takes_splats_along_as_a_rigid_body(move: object) -> None:
+    """A quarter turn about z around the node, then its offset; the ellipsoids turn as well."""
+    assert callable(move)
+    node, offset = torch.tensor([[1.0, 2.0, 3.0]]), torch.tensor([[0.1, 0.2, 0.3]])
+    turn = torch.tensor([[math.cos(math.pi / 4) - 1, 0.0, 0.0, math.sin(math.pi / 4)]])
+    deformation = torch.cat([offset, turn, torch.full((1, 3), 0.5)], dim=1)
+    splats = splats_of(5)
+    moved = move(splats, node, torch.zeros(1), transforms(node, deformation), guesses(5, 1))
+    x, y, z = (splats.means - node).unbind(1)
+    expected = torch.stack([-y, x, z], dim=1) + node + offset
+    torch.testing.assert_close(moved.means, expected, rtol=1e-5, atol=1e-6)
+    quarter = torch.tensor([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    turned = quarter @ quat_to_rotmat(splats.quats)
+    torch.testing.assert_close(quat_to_rotmat(moved.quats), turned, rtol=1e-5, atol=1e-5)
+    torch.testing.assert_close(moved.log_scales, splats.log_scales + 0.5)
+    assert moved.sh is splats.sh and moved.logit_opacities is splats.logit_opacities
+
+
+def test_nearer_nodes_weigh_more_and_radii_say_by_how_much() -> None:
+    """Two nodes at distance 1 and 2 of radius 1: weights 1 : exp(-(4 - 1) / 2)."""
+    nodes = torch.tensor([[1.0, 0.0, 0.0], [-2.0, 0.0, 0.0]])
+    deformation = torch.zeros(2, OUTPUTS)
+    deformation[0, 1], deformation[1, 2] = 1.0, 1.0
+    splats = splats_of(1)
+    splats.means.zero_()
+    near = torch.tensor([[0, 1]], dtype=torch.int32)
+    moved = skin(splats, nodes, torch.zeros(2), transforms(nodes, deformation), near)
+    second = 1 / (1 + math.exp(1.5))
+    torch.testing.assert_close(moved.means, torch.tensor([[0.0, 1 - second, second]]))
+
+
+@pytest.mark.parametrize(("count", "kept"), [(0, 4), (1, 1), (333, 4), (200, 20)])
+def test_the_kernel_matches_the_twin(count: int, kept: int) -> None:
+    results = []
+    near = nearest_nodes(splats_of(count).means, nodes_of(20)[0], guesses(count, kept))
+    for move, dtype in ((skin, torch.float32), (skin_twin, torch.float64)):
+        splats = splats_of(count).map(lambda t, to=dtype: t.to(to, copy=True).requires_grad_())
+        nodes, log_radii, deformation = leaves(nodes_of(20), dtype)
+        moved = move(splats, nodes, log_radii, transforms(nodes, deformation), near)
+        parts = [moved.means, moved.quats, moved.log_scales]
+        rng = generator(5)
+        loss = sum((part * torch.randn(part.shape, generator=rng)).sum() for part in parts)
+        assert isinstance(loss, Tensor)
+        loss.backward()
+        inputs = [splats.means, splats.quats, splats.log_scales, nodes, log_radii, deformation]
+        results.append([*parts, *(tensor.grad for tensor in inputs)])
+    for i, (found, exact) in enumerate(zip(*results, strict=True)):
+        assert_near(found, exact, 1e-5, str(i))
+
+
+def test_the_twin_s_gradients_are_those_of_finite_differences() -> None:
+    stored = splats_of(3).map(lambda t: t.double())
+    near = nearest_nodes(stored.means, nodes_of(6)[0].double(), guesses(3, 3))
+
+    def moved(means: Tensor, quats: Tensor, *by: Tensor) -> tuple[Tensor, ...]:
+        nodes, log_radii, deformation = by
+        own = Splats(means, quats, stored.log_scales, stored.logit_opacities, stored.sh)
+        found = skin_twin(own, nodes, log_radii, transforms(nodes, deformation), near)
+        return found.means, found.quats, found.log_scales
+
+    given = leaves([stored.means, stored.quats, *nodes_of(6)], torch.float64)
+    assert torch.autograd.gradcheck(moved, given)
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(1, 200), st.integers(1, 70), st.integers(1, 9), st.integers(0, 2**31))
+def test_the_nearest_nodes_are_what_scipy_finds_whatever_the_guess(
+    count: int, size: int, kept: int, seed: int
+) -> None:
+    rng = generator(seed)
+    points, nodes = torch.randn(count, 3, generator=rng), torch.randn(size, 3, generator=rng)
+    kept = min(kept, size)
+    exact = cKDTree(nodes.double()).query(points.double(), k=kept)[0].reshape(count, kept)
+    guess = torch.randint(size, (count, kept), generator=rng).to(torch.int32)
+    found = nearest_nodes(points, nodes, guesses(count, kept))
+    for near in (found, nearest_nodes(points, nodes, guess), nearest_nodes(points, nodes, found)):
+        assert torch.equal(near, found)
+    assert all(len(set(row)) == kept for row in found.tolist())
+    distances = (points[:, None] - nodes[found.long()]).norm(dim=2)
+    torch.testing.assert_close(distances.double(), torch.from_numpy(exact), rtol=1e-5, atol=1e-5)
+    twin = nearest_nodes(points.double(), nodes.double(), guess)
+    apart = (points[:, None] - nodes[twin.long()]).norm(dim=2)
+    torch.testing.assert_close(apart, distances, rtol=1e-5, atol=1e-5)
+
+
+def test_of_equally_near_nodes_the_first_are_found() -> None:
+    nodes = torch.tensor([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0]] * 9)
+    for points in (torch.zeros(2, 3), torch.zeros(2, 3, dtype=torch.float64)):
+        found = nearest_nodes(points, nodes.to(points), guesses(2, 3))
+        assert found.tolist() == [[0, 1, 2]] * 2
+
+
+def test_nodes_spread_from_end_to_end() -> None:
+    points = torch.zeros(101, 3)
+    points[:, 1] = torch.linspace(0, 1, 101)
+    nodes = spread_nodes(points[torch.randperm(101, generator=generator())], 5)
+    ends = nodes[:, 1].sort().values
+    assert ends[0] == 0 and ends[-1] == 1
+    assert float(ends.diff().min()) > 0.1
+    assert len(spread_nodes(points[:3], 8)) == 8  # fewer points than nodes are taken repeatedly
+
+
+def test_spacing_is_that_of_a_lattice() -> None:
+    axis = torch.arange(4.0)
+    lattice = 0.25 * torch.cartesian_prod(axis, axis, axis)
+    torch.testing.assert_close(spacing(lattice), torch.full((64,), 0.25))
+
+
+def test_results_do_not_depend_on_the_number_of_threads() -> None:
+    def compute() -> list[Tensor]:
+        splats = splats_of(500).map(torch.nn.Parameter)
+        nodes, log_radii, deformation = leaves(nodes_of(40), torch.float32)
+        near = nearest_nodes(splats.means, nodes, guesses(500, 4))
+        moved = skin(splats, nodes, log_radii, transforms(nodes, deformation), near)
+        (moved.means.square().sum() + moved.quats.square().sum()).backward()
+        found = [splats.means, splats.quats, nodes, log_radii, deformation]
+        gradients = [tensor.grad for tensor in found]
+        return [near, moved.means, *(g for g in gradients if g is not None)]
+
+    assert_same_on_threads(compute)
