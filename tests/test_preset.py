@@ -37,7 +37,7 @@ def refusal(name: str | None, config: Path | None, *overrides: str) -> str:
 
 
 def test_the_presets_ship() -> None:
-    names = {"default", "dnerf", "hexplane", "static", "4dgs", "gsdmsr-literal"}
+    names = {"default", "dnerf", "hexplane", "static", "4dgs", "gsdmsr", "gsdmsr-literal"}
     names |= {"video", "nerfies", "hypernerf", "n3v", "dynamic-object"}
     assert names <= set(preset_files.preset_names())
 
@@ -60,12 +60,11 @@ def test_the_default_preset_spells_out_every_default() -> None:
         assert options.keys() <= mapping[topic].keys(), topic
 
 
-def test_hexplane_and_static_differ_from_dnerf_in_the_motion_alone() -> None:
-    dnerf = load_preset("dnerf", None, [])
-    for name in ("hexplane", "static"):
-        other = load_preset(name, None, [])
-        assert other.motion["name"] == name
-        assert dataclasses.replace(other, motion=dnerf.motion) == dnerf
+@pytest.mark.parametrize(("name", "base"), [("static", "dnerf"), ("hexplane", "gsdmsr")])
+def test_these_differ_from_their_base_in_the_motion_alone(name: str, base: str) -> None:
+    own, other = load_preset(name, None, []), load_preset(base, None, [])
+    assert own.motion["name"] == name
+    assert dataclasses.replace(own, motion=other.motion) == other
 
 
 def test_layers_override_in_order(shelf: Path, tmp_path: Path) -> None:

@@ -24,7 +24,7 @@ CASES = {
 }
 """Sides of pictures and numbers of splats, by device."""
 
-MOTIONS = ("hexplane", "multiscale")
+MOTIONS = ("hexplane", "multiscale", "nodes")
 
 
 def run(yardstick_folder: Path | None, device: str, as_json: bool) -> None:

@@ -52,11 +52,11 @@ def spacing(nodes: Tensor) -> Tensor:
 
 @torch.no_grad()
 def nearest_nodes(points: Tensor, nodes: Tensor, near: Tensor) -> Tensor:
-    """Return the nearest nodes of each point, the nearest first, (N, K) int32.
+    """Return the rows of the nearest nodes of each point, in ascending order, (N, K) int32.
 
     Args:
         points, nodes: (N, 3), (M, 3).
-        near: (N, K) int32, rows of nodes that may be the nearest, as those of a moment ago are:
+        near: (N, K) int32, rows that may be the nearest's, as those of a moment ago are, or zeros:
             what they are changes nothing but the time it takes. K is at most M.
     """
     if has_kernels(points, nodes):
@@ -66,8 +66,8 @@ def nearest_nodes(points: Tensor, nodes: Tensor, near: Tensor) -> Tensor:
     parts = [torch.empty_like(near[:0])]
     for some in points.split(_CHUNK):
         distances = (some[:, None] - nodes).square().sum(dim=2)
-        order = distances.argsort(dim=1, stable=True)[:, : near.shape[1]]
-        parts.append(order.to(torch.int32))
+        found = distances.topk(near.shape[1], largest=False).indices
+        parts.append(found.sort(dim=1).values.to(torch.int32))
     return torch.cat(parts)
 
 
@@ -152,18 +152,20 @@ class _Skin(Function):
         means, quats, log_scales = (t.contiguous() for t in (means, quats, log_scales))
         sharpness = torch.exp(-2 * log_radii)
         by = [t.contiguous() for t in (nodes, sharpness, transforms, near)]
+        weights = torch.empty(near.shape)
         moved = torch.empty_like(means), torch.empty_like(quats), torch.empty_like(log_scales)
-        kernels.skin(*_arrays(means, quats, log_scales, *by, *moved))
-        ctx.save_for_backward(means, quats, *by)
+        kernels.skin(*_arrays(means, quats, log_scales, *by, weights, *moved))
+        ctx.save_for_backward(means, quats, *by, weights)
         return moved
 
     @staticmethod
     @once_differentiable  # type: ignore[untyped-decorator]
     def backward(ctx: Any, *given: Tensor) -> tuple[Tensor | None, ...]:
-        *learnt, near = ctx.saved_tensors
+        *learnt, near, weights = ctx.saved_tensors
         d_moved, d_turned, d_scaled = (d.contiguous() for d in given)
         gradients = [torch.empty_like(tensor) for tensor in learnt]
-        kernels.skin_backward(*_arrays(*learnt, near, d_moved, d_turned, d_scaled, *gradients))
+        given = near, weights, d_moved, d_turned, d_scaled
+        kernels.skin_backward(*_arrays(*learnt, *given, *gradients))
         d_means, d_quats, *others = gradients
         return d_means, d_quats, d_scaled, *others, None
 

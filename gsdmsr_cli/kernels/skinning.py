@@ -72,28 +72,68 @@ def _outside(x, corners, boxes, axis, at):
 
 
 @inline
+def _square(means, i, nodes, j):
+    """Return the squared distance of a point to a node."""
+    x, y, z = means[i, 0] - nodes[j, 0], means[i, 1] - nodes[j, 1], means[i, 2] - nodes[j, 2]
+    return x * x + y * y + z * z
+
+
+@inline
 def _bound(points, i, nodes, near):
-    """Return a squared distance within which as many nodes lie as are sought, if that is known."""
+    """Return a squared distance that the guessed nodes lie within, infinite if they are no guess.
+
+    Guesses are rows in ascending order.
+    """
     kept, bound = near.shape[1], _ZERO
     for k in range(kept):
-        for other in range(k):
-            if near[i, k] == near[i, other]:
-                return _INFINITE
         j = near[i, k]
-        x, y, z = points[i, 0] - nodes[j, 0], points[i, 1] - nodes[j, 1], points[i, 2] - nodes[j, 2]
-        bound = max(bound, x * x + y * y + z * z)
+        if k > 0 and j <= near[i, k - 1]:
+            return _INFINITE
+        bound = max(bound, _square(points, i, nodes, j))
     return bound * _SLACK + float32(1e-30)
+
+
+@inline
+def _distances(x, y, z, flat, padded, j):
+    """Return the squared distances to 16 nodes in a row."""
+    a = simd.load(flat, j) - x
+    b = simd.load(flat, padded + j) - y
+    c = simd.load(flat, 2 * padded + j) - z
+    return a * a + b * b + c * c
+
+
+@inline
+def _nodes_within(x, y, z, flat, padded, bound):
+    """Return how many nodes lie within a squared distance."""
+    limit, one, count = simd.splat(bound), simd.splat(float32(1)), simd.splat(_ZERO)
+    for j in range(0, padded, _LANES):
+        count = count + simd.where_ge(limit, _distances(x, y, z, flat, padded, j), one)
+    return int(simd.reduce_sum(count))
+
+
+@inline
+def _sort(rows, i):
+    """Put a row's values into ascending order."""
+    for k in range(1, rows.shape[1]):
+        value, at = rows[i, k], k
+        while at > 0 and rows[i, at - 1] > value:
+            rows[i, at] = rows[i, at - 1]
+            at -= 1
+        rows[i, at] = value
 
 
 @parallel
 def nearest(points, nodes, near):
     """Find the nearest nodes of each point, exactly.
 
+    Guesses mostly prove right: then no other node lies within their distance, which is counted
+    without a branch. The others are searched for in the boxes that are near enough.
+
     Args:
         points: (N, 3).
         nodes: (M, 3); it is quick where those that follow each other lie near each other.
-        near: (N, K) int32, K at most M; in: guesses, rows of nodes, which shorten the search; out:
-            the rows of the nearest, the nearest first; of equally near ones the first.
+        near: (N, K) int32, K at most M; in: guesses, an earlier result or zeros; out: the rows of
+            the nearest, in ascending order; of equally near ones the first.
     """
     n, kept = near.shape
     padded = (nodes.shape[0] + _LANES - 1) // _LANES * _LANES
@@ -105,7 +145,10 @@ def nearest(points, nodes, near):
         best = np.empty(kept, np.float32)
         for i in range(n * block // _BLOCKS, n * (block + 1) // _BLOCKS):
             x, y, z = simd.splat(points[i, 0]), simd.splat(points[i, 1]), simd.splat(points[i, 2])
-            best[:] = _bound(points, i, nodes, near)
+            bound = _bound(points, i, nodes, near)
+            if bound < _INFINITE and _nodes_within(x, y, z, flat, padded, bound) == kept:
+                continue
+            best[:] = bound
             for o in range(0, boxes, _LANES):
                 a = _outside(x, corners, boxes, 0, o)
                 b = _outside(y, corners, boxes, 1, o)
@@ -114,37 +157,29 @@ def nearest(points, nodes, near):
             for g in range(padded // _LANES):
                 if away[g] >= best[kept - 1]:
                     continue
-                j = g * _LANES
-                a = simd.load(flat, j) - x
-                b = simd.load(flat, padded + j) - y
-                c = simd.load(flat, 2 * padded + j) - z
-                simd.store(distances, 0, a * a + b * b + c * c)
-                for lane in range(min(_LANES, nodes.shape[0] - j)):
+                simd.store(distances, 0, _distances(x, y, z, flat, padded, g * _LANES))
+                for lane in range(min(_LANES, nodes.shape[0] - g * _LANES)):
                     if distances[lane] < best[kept - 1]:
                         k = kept - 1
                         while k > 0 and best[k - 1] > distances[lane]:
                             best[k], near[i, k] = best[k - 1], near[i, k - 1]
                             k -= 1
-                        best[k], near[i, k] = distances[lane], j + lane
+                        best[k], near[i, k] = distances[lane], g * _LANES + lane
+            _sort(near, i)
 
 
 @inline
-def _weigh(means, i, nodes, sharpness, near, weights, squares):
-    """Write the weights of a splat's nodes, and the squared distances to them."""
-    kept = near.shape[1]
-    highest = -_INFINITE
+def _weigh(means, i, nodes, sharpness, near, weights):
+    """Write the weights of a splat's nodes."""
+    kept, highest, total = near.shape[1], -_INFINITE, _ZERO
     for k in range(kept):
-        j = near[i, k]
-        x, y, z = means[i, 0] - nodes[j, 0], means[i, 1] - nodes[j, 1], means[i, 2] - nodes[j, 2]
-        squares[k] = x * x + y * y + z * z
-        weights[k] = -_HALF * squares[k] * sharpness[j]
-        highest = max(highest, weights[k])
-    total = _ZERO
+        weights[i, k] = -_HALF * _square(means, i, nodes, near[i, k]) * sharpness[near[i, k]]
+        highest = max(highest, weights[i, k])
     for k in range(kept):
-        weights[k] = math.exp(weights[k] - highest)
-        total += weights[k]
+        weights[i, k] = math.exp(weights[i, k] - highest)
+        total += weights[i, k]
     for k in range(kept):
-        weights[k] /= total
+        weights[i, k] /= total
 
 
 @inline
@@ -153,15 +188,15 @@ def _blend(transforms, near, i, weights, blend):
     for c in range(COLUMNS):
         blend[c] = _ZERO
     for k in range(near.shape[1]):
-        j, w = near[i, k], weights[k]
+        j, w = near[i, k], weights[i, k]
         for c in range(COLUMNS):
             blend[c] += w * transforms[j, c]
 
 
 @parallel
 def skin(
-    means, quats, log_scales, nodes, sharpness, transforms, near, moved, turned, scaled
-):  # fmt: skip
+    means, quats, log_scales, nodes, sharpness, transforms, near, weights, moved, turned, scaled
+):
     """Move N splats by M nodes.
 
     Args:
@@ -170,14 +205,14 @@ def skin(
         sharpness: (M,) inverse squared radii.
         transforms: (M, 19).
         near: (N, K) rows of the nodes of each splat.
+        weights: (N, K) of these nodes, out.
         moved, turned, scaled: like the first three, out.
     """
-    n, kept = near.shape
+    n = near.shape[0]
     for block in prange(_BLOCKS):
-        weights, squares = np.empty(kept, np.float32), np.empty(kept, np.float32)
         t = np.empty(COLUMNS, np.float32)
         for i in range(n * block // _BLOCKS, n * (block + 1) // _BLOCKS):
-            _weigh(means, i, nodes, sharpness, near, weights, squares)
+            _weigh(means, i, nodes, sharpness, near, weights)
             _blend(transforms, near, i, weights, t)
             for r in range(3):
                 shift = t[OFFSET + r]
@@ -195,7 +230,7 @@ def skin(
 
 @parallel
 def skin_backward(
-    means, quats, nodes, sharpness, transforms, near, d_moved, d_turned, d_scaled,
+    means, quats, nodes, sharpness, transforms, near, weights, d_moved, d_turned, d_scaled,
     d_means, d_quats, d_nodes, d_log_radii, d_transforms,
 ):  # fmt: skip
     """Write the gradients of ``skin``; that of the log scales is ``d_scaled``.
@@ -210,11 +245,9 @@ def skin_backward(
     count, width = nodes.shape[0], COLUMNS + 4
     sums = np.zeros((_BLOCKS, count, width), np.float32)
     for block in prange(_BLOCKS):
-        weights, squares = np.empty(kept, np.float32), np.empty(kept, np.float32)
         t, d_t = np.empty(COLUMNS, np.float32), np.empty(COLUMNS, np.float32)
         d_weights = np.empty(kept, np.float32)
         for i in range(n * block // _BLOCKS, n * (block + 1) // _BLOCKS):
-            _weigh(means, i, nodes, sharpness, near, weights, squares)
             _blend(transforms, near, i, weights, t)
             for r in range(3):
                 d_t[OFFSET + r], d_t[GROWTH + r] = d_moved[i, r], d_scaled[i, r]
@@ -235,7 +268,7 @@ def skin_backward(
             d_quats[i, 3] = h + (-e * d + f * c - g * b + h * a)
             mean = _ZERO
             for k in range(kept):
-                j, own, total = near[i, k], weights[k], _ZERO
+                j, own, total = near[i, k], weights[i, k], _ZERO
                 for s in range(COLUMNS):
                     total += transforms[j, s] * d_t[s]
                     sums[block, j, s] += own * d_t[s]
@@ -243,8 +276,8 @@ def skin_backward(
                 mean += own * total
             for k in range(kept):
                 j = near[i, k]
-                given = weights[k] * (d_weights[k] - mean) * sharpness[j]
-                sums[block, j, COLUMNS + 3] += given * squares[k]
+                given = weights[i, k] * (d_weights[k] - mean) * sharpness[j]
+                sums[block, j, COLUMNS + 3] += given * _square(means, i, nodes, j)
                 for s in range(3):
                     pull = given * (means[i, s] - nodes[j, s])
                     d_means[i, s] -= pull

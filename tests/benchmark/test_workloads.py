@@ -42,7 +42,7 @@ def test_drawing_takes_the_gradients_of_all_that_is_stored(monkeypatch: pytest.M
     assert all(tensor.grad is None for tensor in drawn[0].tensors().values())
 
 
-@pytest.mark.parametrize("motion", ["hexplane", "multiscale"])
+@pytest.mark.parametrize("motion", ["hexplane", "multiscale", "nodes"])
 def test_a_step_takes_all_gradients_and_moves_nothing(
     motion: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
