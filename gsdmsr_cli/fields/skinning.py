@@ -80,9 +80,10 @@ def transforms(nodes: Tensor, deformation: Tensor) -> Tensor:
             unit length, and of the log scales.
     """
     offset, turn, growth = deformation.split(PARTS, dim=1)
-    nothing = turn.new_tensor([1.0, 0.0, 0.0, 0.0])
+    nothing = torch.zeros_like(turn)
+    nothing[:, 0] = 1
     quats = torch.nn.functional.normalize(nothing + turn, dim=1)
-    matrix = quat_to_rotmat(quats) - torch.eye(3).to(turn)
+    matrix = quat_to_rotmat(quats) - torch.eye(3, dtype=turn.dtype, device=turn.device)
     shift = offset - (matrix @ nodes[:, :, None])[:, :, 0]
     return torch.cat([matrix.flatten(1), shift, quats - nothing, growth], dim=1)
 
