@@ -165,7 +165,7 @@ def test_a_layout_is_trained_on_scored_and_filmed(
     assert scene.layout == layout
     assert np.isfinite(scene.bound) and 1 < scene.bound < 10
     options = [f"--set={setting}" for setting in SETTINGS]
-    gsdmsr("train", "--data", data, "--out", run, "--preset", "dnerf", "--steps", STEPS, *options)
+    gsdmsr("train", "--data", data, "--out", run, "--preset", "gsdmsr", "--steps", STEPS, *options)
     gsdmsr("eval", run)
     gsdmsr("render", run, "--path", "test", "--video", "none")
     metrics = json.loads((run / "eval" / "metrics.json").read_text())
