@@ -165,8 +165,8 @@ class _Skin(Function):
         *learnt, near, weights = ctx.saved_tensors
         d_moved, d_turned, d_scaled = (d.contiguous() for d in given)
         gradients = [torch.empty_like(tensor) for tensor in learnt]
-        given = near, weights, d_moved, d_turned, d_scaled
-        kernels.skin_backward(*_arrays(*learnt, *given, *gradients))
+        incoming = d_moved, d_turned, d_scaled
+        kernels.skin_backward(*_arrays(*learnt, near, weights, *incoming, *gradients))
         d_means, d_quats, *others = gradients
         return d_means, d_quats, d_scaled, *others, None
 

@@ -16,8 +16,8 @@ from numba import float32, prange
 from gsdmsr_cli.kernels import simd
 from gsdmsr_cli.kernels.jit import inline, parallel, serial
 
-MATRIX, OFFSET, QUAT, GROWTH, COLUMNS = 0, 9, 12, 16, 19
-"""Where the parts of a transform begin, and how many columns it has."""
+OFFSET, QUAT, GROWTH, COLUMNS = 9, 12, 16, 19
+"""Where the parts of a transform behind its matrix begin, and how many columns it has."""
 
 _LANES = simd.LANES
 _BLOCKS = 16
@@ -72,9 +72,9 @@ def _outside(x, corners, boxes, axis, at):
 
 
 @inline
-def _square(means, i, nodes, j):
+def _square(points, i, nodes, j):
     """Return the squared distance of a point to a node."""
-    x, y, z = means[i, 0] - nodes[j, 0], means[i, 1] - nodes[j, 1], means[i, 2] - nodes[j, 2]
+    x, y, z = points[i, 0] - nodes[j, 0], points[i, 1] - nodes[j, 1], points[i, 2] - nodes[j, 2]
     return x * x + y * y + z * z
 
 
