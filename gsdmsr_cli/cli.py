@@ -458,6 +458,10 @@ def scenes(
     lpips_weights: Annotated[
         Path | None, typer.Option(metavar="DIR", help="Folder of LPIPS weights.")
     ] = None,
+    jobs: Annotated[
+        int,
+        typer.Option(min=1, metavar="N", help="Trials side by side, each on its share of cores."),
+    ] = 1,
     as_json: Json = False,
 ) -> None:
     """Train presets on scenes at equal lengths and print the table of their scores."""
@@ -467,7 +471,7 @@ def scenes(
     from gsdmsr_cli.benchmark.trials import Terms
     from gsdmsr_cli.commands import benchmark_scenes as command
 
-    terms = Terms(downscale, background, split, lpips_weights)
+    terms = Terms(downscale, background, split, lpips_weights, jobs)
     presets: list[str | Path] = [*(preset or []), *(config or [])]
     command.run(folders, out, presets or ["dnerf"], lengths, seed or [0], terms, as_json)
 

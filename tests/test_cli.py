@@ -182,7 +182,7 @@ def test_version(gsdmsr: Gsdmsr, capsys: pytest.CaptureFixture[str]) -> None:
         (
             "benchmark scenes a b --out o --preset static --preset dnerf --budget 2m --budget 8m"
             " --seed 1 --seed 2 --downscale 2 --background black --split val --lpips-weights w"
-            " --json",
+            " --jobs 2 --json",
             "benchmark_scenes",
             (
                 [Path("a"), Path("b")],
@@ -190,7 +190,7 @@ def test_version(gsdmsr: Gsdmsr, capsys: pytest.CaptureFixture[str]) -> None:
                 ["static", "dnerf"],
                 ["2m", "8m"],
                 [1, 2],
-                Terms(2, "black", "val", Path("w")),
+                Terms(2, "black", "val", Path("w"), 2),
                 True,
             ),
         ),

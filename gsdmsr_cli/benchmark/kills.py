@@ -13,7 +13,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from gsdmsr_cli.benchmark.trials import call
+from gsdmsr_cli.benchmark.calls import call
 from gsdmsr_cli.errors import DataError, GsdmsrError
 from gsdmsr_cli.run import Checkpoint, is_run, open_run
 

@@ -8,22 +8,18 @@ from __future__ import annotations
 
 import itertools
 import json
-import signal
-import subprocess
-import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from gsdmsr_cli.errors import DataError, GsdmsrError
+from gsdmsr_cli.benchmark.calls import Line, call, call_side_by_side
+from gsdmsr_cli.errors import DataError
 from gsdmsr_cli.files import read_json
 from gsdmsr_cli.formats import read_scene
+from gsdmsr_cli.machine import cores
 from gsdmsr_cli.preset import Preset, load_preset
 from gsdmsr_cli.run import Run, is_run, open_run
-
-INTERRUPTED = 130
-"""Exit code of a command that Ctrl-C has ended."""
 
 
 @dataclass(frozen=True)
@@ -35,12 +31,19 @@ class Terms:
         background: "white" or "black".
         split: the views that are compared, "test" or "val".
         lpips_weights: folder of weights, or None for the usual places.
+        jobs: how many run side by side, each on its share of the cores.
     """
 
     downscale: int
     background: str
     split: str
     lpips_weights: Path | None
+    jobs: int = 1
+
+    @property
+    def threads(self) -> int | None:
+        """CPU threads of each, None for what its preset says."""
+        return cores() // self.jobs if self.jobs > 1 else None
 
 
 @dataclass(frozen=True)
@@ -79,6 +82,11 @@ class Trial:
         length = self.length if isinstance(self.length, str) else f"{self.length}steps"
         return root / self.scene.resolve().name / f"{self.name}-{length}-{self.seed}"
 
+    def log(self, root: Path) -> Path:
+        """Return the file for what the trial shows while others run beside it."""
+        folder = self.folder(root)
+        return folder.with_name(f"{folder.name}.log")
+
     def overrides(self, terms: Terms) -> list[str]:
         """Return what differs from the preset, as ``--set`` takes it."""
         timed = isinstance(self.length, str)
@@ -88,6 +96,7 @@ class Trial:
             f"training.seed={self.seed}",
             f"data.downscale={terms.downscale}",
             f"data.background={terms.background}",
+            *([f"training.threads={terms.threads}"] if terms.threads else []),
         ]
 
 
@@ -99,6 +108,8 @@ def all_trials(
 ) -> list[Trial]:
     """Return every combination, so ordered that a part of them is a table already.
 
+    Presets follow each other on the same scene, so that a machine whose speed drifts is fair.
+
     Raises:
         DataError: two scenes or two presets would share a folder.
     """
@@ -109,8 +120,8 @@ def all_trials(
         for name in names:
             if names.count(name) > 1:
                 raise DataError(f"two {kind}s are called '{name}'; each needs its own name, once")
-    combined = itertools.product(lengths, seeds, presets, scenes)
-    return [Trial(scene, preset, length, seed) for length, seed, preset, scene in combined]
+    combined = itertools.product(lengths, seeds, scenes, presets)
+    return [Trial(scene, preset, length, seed) for length, seed, scene, preset in combined]
 
 
 def run_trial(trial: Trial, root: Path, terms: Terms) -> dict[str, Any]:
@@ -120,6 +131,37 @@ def run_trial(trial: Trial, root: Path, terms: Terms) -> dict[str, Any]:
         DataError: the folder holds a training with other options or of other data.
         GsdmsrError: training or evaluation has failed; its own message stands above.
         KeyboardInterrupt: Ctrl-C; the training has saved a checkpoint.
+    """
+    for line in _left_to_do(trial, root, terms):
+        call(*line)
+    return _report(trial, root)
+
+
+def run_side_by_side(trials: Sequence[Trial], root: Path, terms: Terms) -> list[dict[str, Any]]:
+    """Do what ``run_trial`` does for several at once; what they show goes to ``trial.log(root)``.
+
+    Raises:
+        DataError, GsdmsrError, KeyboardInterrupt: see ``run_trial``; the others are finished, or
+            interrupted as well.
+    """
+    works = {trial.log(root): _left_to_do(trial, root, terms) for trial in trials}
+    call_side_by_side(works, terms.threads or cores())
+    return [_report(trial, root) for trial in trials]
+
+
+def _report(trial: Trial, root: Path) -> dict[str, Any]:
+    return read_json(_report_path(trial, root))
+
+
+def _report_path(trial: Trial, root: Path) -> Path:
+    return trial.folder(root) / "eval" / "metrics.json"
+
+
+def _left_to_do(trial: Trial, root: Path, terms: Terms) -> Iterator[Line]:
+    """Yield the commands that are still to be run, each once those before have ended.
+
+    Raises:
+        DataError: see ``run_trial``.
     """
     folder = trial.folder(root)
     run = open_run(folder) if is_run(folder) else None
@@ -131,13 +173,11 @@ def run_trial(trial: Trial, root: Path, terms: Terms) -> dict[str, Any]:
         how = "--overwrite" if saved is None else "--resume"
         places = ["--data", str(trial.scene), "--out", str(folder)]
         kind = "--config" if isinstance(trial.preset, Path) else "--preset"
-        call("train", *places, kind, str(trial.preset), *settings, how)
+        yield ["train", *places, kind, str(trial.preset), *settings, how]
         saved = None
-    report = folder / "eval" / "metrics.json"
-    if saved is None or not _is_report_of(report, saved.step, terms):
+    if saved is None or not _is_report_of(_report_path(trial, root), saved.step, terms):
         weights = ["--lpips-weights", str(terms.lpips_weights)] if terms.lpips_weights else []
-        call("eval", str(folder), "--split", terms.split, "--data", str(trial.scene), *weights)
-    return read_json(report)
+        yield ["eval", str(folder), "--split", terms.split, "--data", str(trial.scene), *weights]
 
 
 def _require_same(run: Run, trial: Trial, terms: Terms) -> None:
@@ -157,31 +197,3 @@ def _is_report_of(path: Path, step: int, terms: Terms) -> bool:
     found = about["split"], about["background"], about["downscale"]
     wanted = terms.split, terms.background, terms.downscale
     return found == wanted and about["checkpoint_step"] == step
-
-
-def call(*arguments: str) -> None:
-    """Run a command of ours; what it shows goes to stderr, and Ctrl-C is handed on to it.
-
-    Raises:
-        GsdmsrError: it has failed; its own message stands above.
-        KeyboardInterrupt: Ctrl-C has ended it.
-    """
-    command = [sys.executable, "-m", "gsdmsr_cli.cli", *arguments]
-    # In a session of its own, or a terminal would interrupt it as well: a second Ctrl-C, at which
-    # a training no longer waits to save what it has.
-    process = subprocess.Popen(command, stdout=sys.stderr.fileno(), start_new_session=True)
-    interrupted = False
-    while True:
-        try:
-            code = process.wait()
-            break
-        except KeyboardInterrupt:
-            interrupted = True
-            process.send_signal(signal.SIGINT)
-    if interrupted or code == INTERRUPTED:
-        raise KeyboardInterrupt
-    if code:
-        raise GsdmsrError(
-            f"gsdmsr {arguments[0]} has failed with exit code {code}; what is finished stays, and "
-            "the same command goes on from there"
-        )

@@ -13,9 +13,11 @@ from rich.table import Table
 
 from gsdmsr_cli.benchmark.curves import charts_of
 from gsdmsr_cli.benchmark.scoreboard import HEADS, TEXTS, cells, markdown, rows_of
-from gsdmsr_cli.benchmark.trials import Terms, all_trials, run_trial
+from gsdmsr_cli.benchmark.trials import Terms, Trial, all_trials, run_side_by_side, run_trial
+from gsdmsr_cli.errors import UsageError
 from gsdmsr_cli.files import write_json, write_text
 from gsdmsr_cli.formats import read_scene
+from gsdmsr_cli.machine import cores
 
 SCHEMA = 1
 
@@ -34,23 +36,34 @@ def run(
 ) -> None:
     """Run every trial that is still to do, and write ``table.json``, ``table.md`` and charts.
 
-    They are written after every trial, so that an interrupted benchmark leaves a table.
+    They are written after every ``terms.jobs`` trials, which run side by side, so that an
+    interrupted benchmark leaves a table.
 
     Raises:
-        UsageError: a preset or a length does not exist.
+        UsageError: a preset or a length does not exist, or there are more jobs than cores.
         DataError: a scene or a folder below ``out`` cannot be used.
         GsdmsrError: a trial has failed.
         KeyboardInterrupt: Ctrl-C; the same command goes on.
     """
+    if terms.jobs > cores():
+        raise UsageError(f"--jobs {terms.jobs}: this machine has {cores()} cores, give no more")
     trials = all_trials(scenes, presets, lengths, seeds)
     for trial in trials:  # told now rather than after hours
         trial.options(terms)
     for scene in scenes:
         read_scene(scene)
-    console, scored = Console(stderr=True), []
-    for number, trial in enumerate(trials, start=1):
-        console.out(f"trial {number} of {len(trials)}: {trial.folder(out)}", highlight=False)
-        scored.append((trial, run_trial(trial, out, terms)))
+    console = Console(stderr=True)
+    scored: list[tuple[Trial, dict[str, Any]]] = []
+    for first in range(0, len(trials), terms.jobs):
+        batch = trials[first : first + terms.jobs]
+        for number, trial in enumerate(batch, start=first + 1):
+            place = trial.folder(out) if terms.jobs == 1 else trial.log(out)
+            console.out(f"trial {number} of {len(trials)}: {place}", highlight=False)
+        if terms.jobs == 1:
+            documents = [run_trial(trial, out, terms) for trial in batch]
+        else:
+            documents = run_side_by_side(batch, out, terms)
+        scored += zip(batch, documents, strict=True)
         rows = rows_of(scored)
         _write(out, rows, terms)
         for name, chart in charts_of([trial for trial, _ in scored], out).items():
@@ -67,6 +80,7 @@ def _document(rows: Sequence[dict[str, Any]], terms: Terms) -> dict[str, Any]:
         "split": terms.split,
         "downscale": terms.downscale,
         "background": terms.background,
+        "threads": terms.threads,
     }
     return {"schema": SCHEMA, "protocol": about, "rows": list(rows)}
 
@@ -78,6 +92,8 @@ def _write(out: Path, rows: Sequence[dict[str, Any]], terms: Terms) -> None:
 
 def _table(rows: Sequence[dict[str, Any]], terms: Terms) -> Table:
     about = f"{terms.split} split, downscale {terms.downscale}, on {terms.background}"
+    if terms.threads:
+        about += f", {terms.threads} of {cores()} cores each"
     table = Table(title=about)
     for place, name in enumerate(HEADS):
         table.add_column(name, justify="left" if place < TEXTS else "right")

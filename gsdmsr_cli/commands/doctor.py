@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import platform
 from importlib import metadata
 from typing import Any
@@ -20,6 +19,7 @@ from gsdmsr_cli.evaluation.lpips import NETS, load_lpips
 from gsdmsr_cli.evaluation.metrics import Missing
 from gsdmsr_cli.filming.encode import require_encoder
 from gsdmsr_cli.filming.request import VIDEOS
+from gsdmsr_cli.machine import cores
 
 _PACKAGES = (
     "torch",
@@ -54,7 +54,7 @@ def examine() -> dict[str, Any]:
         "gsdmsr": __version__,
         "python": platform.python_version(),
         "platform": f"{platform.system()} {platform.release()} {platform.machine()}",
-        "cpu": {"name": llvm.get_host_cpu_name(), "cores": _cores(), "simd": _simd()},
+        "cpu": {"name": llvm.get_host_cpu_name(), "cores": cores(), "simd": _simd()},
         "gpu": availability.describe(),
         "packages": {name: _version(name) for name in _PACKAGES},
         "engines": {name: _engine(name) for name in raster.engine_names()},
@@ -65,13 +65,6 @@ def examine() -> dict[str, Any]:
         "presets": preset_files.preset_names(),
         "videos": {kind: _video(kind) for kind in VIDEOS},
     }
-
-
-def _cores() -> int:
-    """Return the number of cores this process may use, not of all there are."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
 
 
 def _simd() -> list[str]:

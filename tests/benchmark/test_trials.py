@@ -13,9 +13,10 @@ from pathlib import Path
 
 import pytest
 
-from gsdmsr_cli.benchmark import trials
-from gsdmsr_cli.benchmark.trials import Terms, Trial, all_trials, run_trial
-from gsdmsr_cli.errors import DataError, GsdmsrError, UsageError
+from gsdmsr_cli.benchmark import calls, trials
+from gsdmsr_cli.benchmark.trials import Terms, Trial, all_trials, run_side_by_side, run_trial
+from gsdmsr_cli.errors import DataError, UsageError
+from gsdmsr_cli.machine import cores
 from gsdmsr_cli.preset import load_preset
 from gsdmsr_cli.run import open_run
 
@@ -33,7 +34,7 @@ class Commands:
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.lines: list[tuple[str, ...]] = []
-        self.true = trials.call
+        self.true = calls.call
         monkeypatch.setattr(trials, "call", self)
 
     def __call__(self, *arguments: str) -> None:
@@ -70,7 +71,7 @@ def test_trials_are_all_combinations_and_the_short_ones_come_first() -> None:
     assert [t.length for t in found] == ["2m"] * 8 + [30] * 8
     assert [t.seed for t in found[:8]] == [0] * 4 + [1] * 4
     assert found[:4] == [
-        Trial(Path(scene), preset, "2m", 0) for preset in ("dnerf", "static") for scene in "ab"
+        Trial(Path(scene), preset, "2m", 0) for scene in "ab" for preset in ("dnerf", "static")
     ]
     assert len({t.folder(Path("out")) for t in found}) == 16
 
@@ -153,14 +154,6 @@ def test_a_training_of_other_data_is_refused(
         run_trial(Trial(other, "static", STEPS, 1), copied, TERMS)
 
 
-def test_a_command_that_fails_ends_the_trial(
-    tiny_scene: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
-    with pytest.raises(GsdmsrError, match="gsdmsr eval has failed with exit code 3"):
-        trials.call("eval", str(tmp_path / "nothing"))
-    assert "not a run folder" in capfd.readouterr().err
-
-
 def test_the_table_of_a_benchmark(tiny_scene: Path, finished: Path, tmp_path: Path) -> None:
     """The finished trial comes from before; one further preset is trained."""
     out = Path(shutil.copytree(finished, tmp_path / "out"))
@@ -236,20 +229,46 @@ def test_the_table_is_shown_whole_on_whatever_terminal(
     assert "table.md" in done.stdout
 
 
-def test_ctrl_c_saves_the_training_that_is_under_way(tiny_scene: Path, tmp_path: Path) -> None:
+@pytest.mark.skipif(cores() < 2, reason="one core")
+def test_trials_side_by_side_share_the_cores(tiny_scene: Path, tmp_path: Path) -> None:
+    two = [Trial(tiny_scene, "static", STEPS, seed) for seed in (1, 2)]
+    terms = Terms(1, "white", "test", None, jobs=2)
+    found = run_side_by_side(two, tmp_path, terms)
+    assert [document["training"]["steps"] for document in found] == [STEPS, STEPS]
+    threads = {open_run(trial.folder(tmp_path)).preset.training.threads for trial in two}
+    assert threads == {cores() // 2}
+    assert all("100%" in trial.log(tmp_path).read_text(encoding="utf-8") for trial in two)
+    assert run_side_by_side(two, tmp_path, terms) == found
+
+
+def test_more_trials_at_once_than_cores_are_refused(tiny_scene: Path, tmp_path: Path) -> None:
+    line = ["benchmark", "scenes", tiny_scene, "--out", tmp_path / "out", "--steps", STEPS]
+    done = gsdmsr(*line, "--jobs", cores() + 1)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert f"this machine has {cores()} cores" in done.stderr
+
+
+@pytest.mark.parametrize("jobs", [1, min(2, cores())])
+def test_ctrl_c_saves_the_training_that_is_under_way(
+    jobs: int, tiny_scene: Path, tmp_path: Path
+) -> None:
     out = tmp_path / "out"
     line = ["benchmark", "scenes", tiny_scene, "--out", out, "--preset", "static", "--steps", 10**7]
+    line += ["--jobs", jobs, "--seed", 0, "--seed", 1]
     process = subprocess.Popen(
         [sys.executable, "-m", "gsdmsr_cli.cli", *map(str, line)],
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True,
     )  # fmt: skip
-    folder = Trial(tiny_scene, "static", 10**7, 0).folder(out)
+    begun = [Trial(tiny_scene, "static", 10**7, seed) for seed in range(jobs)]
+    curves = [trial.folder(out) / "metrics.jsonl" for trial in begun]
     deadline = time.monotonic() + 300
-    while not (folder / "metrics.jsonl").is_file() and time.monotonic() < deadline:
+    while not all(curve.is_file() for curve in curves) and time.monotonic() < deadline:
         assert process.poll() is None, process.communicate()
         time.sleep(0.05)
     os.killpg(process.pid, signal.SIGINT)  # as a terminal does, to the processes in front
     _, error = process.communicate(timeout=60)
     assert process.returncode == 130
-    assert "interrupted at step" in error
-    assert open_run(folder).load().step > 0
+    for trial in begun:
+        shown = error if jobs == 1 else trial.log(out).read_text(encoding="utf-8")
+        assert "interrupted at step" in shown
+        assert open_run(trial.folder(out)).load().step > 0
