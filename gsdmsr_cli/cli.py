@@ -549,15 +549,23 @@ def _run() -> int:
 
 @contextmanager
 def _ctrl_c_that_spares_imports() -> Iterator[None]:
-    """Let Ctrl-C raise KeyboardInterrupt, but not in an import: the core of torch would abort."""
+    """Let Ctrl-C raise KeyboardInterrupt, but not in an import: the core of torch would abort.
+
+    SIGTERM, by which containers and schedulers end a process, does what Ctrl-C does at the time.
+    """
     if threading.current_thread() is not threading.main_thread():
         yield  # where Python allows no handlers
         return
-    before = signal.signal(signal.SIGINT, _interrupt)
+    before = signal.signal(signal.SIGINT, _interrupt), signal.signal(signal.SIGTERM, _terminate)
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, before)
+        signal.signal(signal.SIGINT, before[0])
+        signal.signal(signal.SIGTERM, before[1])
+
+
+def _terminate(_number: int, _frame: FrameType | None) -> None:
+    signal.raise_signal(signal.SIGINT)
 
 
 def _interrupt(_number: int, frame: FrameType | None) -> None:

@@ -248,9 +248,12 @@ def test_more_trials_at_once_than_cores_are_refused(tiny_scene: Path, tmp_path: 
     assert f"this machine has {cores()} cores" in done.stderr
 
 
-@pytest.mark.parametrize("jobs", [1, min(2, cores())])
-def test_ctrl_c_saves_the_training_that_is_under_way(
-    jobs: int, tiny_scene: Path, tmp_path: Path
+@pytest.mark.parametrize(
+    ("jobs", "how"),
+    [(1, signal.SIGINT), (min(2, cores()), signal.SIGINT), (1, signal.SIGTERM)],
+)
+def test_ctrl_c_and_kill_save_the_training_that_is_under_way(
+    jobs: int, how: signal.Signals, tiny_scene: Path, tmp_path: Path
 ) -> None:
     out = tmp_path / "out"
     line = ["benchmark", "scenes", tiny_scene, "--out", out, "--preset", "static", "--steps", 10**7]
@@ -265,7 +268,7 @@ def test_ctrl_c_saves_the_training_that_is_under_way(
     while not all(curve.is_file() for curve in curves) and time.monotonic() < deadline:
         assert process.poll() is None, process.communicate()
         time.sleep(0.05)
-    os.killpg(process.pid, signal.SIGINT)  # as a terminal does, to the processes in front
+    os.killpg(process.pid, how)  # as a terminal does, to the processes in front
     _, error = process.communicate(timeout=60)
     assert process.returncode == 130
     for trial in begun:

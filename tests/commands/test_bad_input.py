@@ -305,7 +305,11 @@ def test_a_png_with_a_wrong_bit_is_refused_without_a_word_from_libpng(
 
 @pytest.mark.parametrize(
     ("statement", "code", "output"),
-    [("import slow", 130, ""), ("os.kill(os.getpid(), signal.SIGINT)", 0, "in order\n")],
+    [
+        ("import slow", 130, ""),
+        ("os.kill(os.getpid(), signal.SIGINT)", 0, "in order\n"),
+        ("os.kill(os.getpid(), signal.SIGTERM)", 0, "in order\n"),
+    ],
 )
 def test_ctrl_c_ends_an_import_at_once_and_everything_else_in_order(
     tmp_path: Path, statement: str, code: int, output: str
@@ -320,7 +324,8 @@ def test_ctrl_c_ends_an_import_at_once_and_everything_else_in_order(
         "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
         f"with cli._ctrl_c_that_spares_imports():\n  try:\n    {statement}\n"
         "  except KeyboardInterrupt:\n    print('in order')\n"
-        "assert signal.getsignal(signal.SIGINT) is signal.default_int_handler"
+        "assert signal.getsignal(signal.SIGINT) is signal.default_int_handler\n"
+        "assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL"
     )
     call = [sys.executable, "-c", program]
     done = subprocess.run(
