@@ -30,6 +30,9 @@ SPACING_OF = 3
 
 _CHUNK = 8192
 
+_COINCIDENT = 1e-4
+"""Squares of distances count as this share of their mean at least: rounding would count else."""
+
 
 def spread_nodes(points: Tensor, count: int) -> Tensor:
     """Return ``count`` of the points (N, 3) that are far from each other, on the CPU.
@@ -86,6 +89,30 @@ def transforms(nodes: Tensor, deformation: Tensor) -> Tensor:
     matrix = quat_to_rotmat(quats) - torch.eye(3, dtype=turn.dtype, device=turn.device)
     shift = offset - (matrix @ nodes[:, :, None])[:, :, 0]
     return torch.cat([matrix.flatten(1), shift, quats - nothing, growth], dim=1)
+
+
+def rigidity(nodes: Tensor, transforms: Tensor, near: Tensor) -> Tensor:
+    """Return how far nodes are from moving as parts of a rigid body, a scalar, 0 where they do.
+
+    The regulariser E_reg of embedded deformation (Sumner, Schmid, Pauly, SIGGRAPH 2007): the square
+    of where a node takes its neighbour less where that goes by itself, here in units of the
+    distance between them; the mean over all pairs.
+
+    Args:
+        nodes: (M, 3) canonical places.
+        transforms: (M, 19), see ``transforms``.
+        near: (M, K) int32, the neighbours of each; itself, if among them, adds 0.
+    """
+    matrix, shift, _, _ = transforms.split(COLUMNS, dim=1)
+    matrix, rows = matrix.unflatten(1, (3, 3)), near.flatten().long()
+    offset = (matrix @ nodes[:, :, None])[:, :, 0] + shift
+    places, goes = (t.index_select(0, rows).unflatten(0, near.shape) for t in (nodes, offset))
+    apart = places - nodes[:, None]
+    taken = apart @ matrix.transpose(1, 2) + offset[:, None]
+    squares = apart.square().sum(dim=2)
+    squares = squares.clamp(min=_COINCIDENT * float(squares.mean()))
+    deviations = (taken - goes).square().sum(dim=2)
+    return torch.mean(deviations / squares)
 
 
 def skin(

@@ -43,6 +43,7 @@ class Options:
         time_ratio: the grid's nodes in time per distinct train time.
         width: width of the network's two hidden layers, a multiple of 16.
         space_smoothness, time_smoothness, time_stillness: weights of the plane regularisers.
+        rigidity: weight of nodes' moving otherwise than as parts of a rigid body would.
     """
 
     count: int = 1024
@@ -54,6 +55,7 @@ class Options:
     space_smoothness: float = 1e-4
     time_smoothness: float = 1e-2
     time_stillness: float = 1e-4
+    rigidity: float = 0.1
 
     def __post_init__(self) -> None:
         strict.require(self, "count", self.count > skinning.SPACING_OF, "4 or more")
@@ -80,6 +82,7 @@ class NodeMotion:
         self.layers = [trained(layer) for layer in network.new_network(widths, generator)]
         self._near: Tensor | None = None
         self._found_for: Tensor | None = None
+        self._pairs = torch.zeros(options.count, options.neighbours, dtype=torch.int32)
 
     def _reach(self, nodes: Tensor) -> Tensor:
         """Return the logarithms of the radii that nodes begin with."""
@@ -87,11 +90,13 @@ class NodeMotion:
 
     def at(self, splats: Splats, time: float) -> Splats:
         """Return the splats where their nodes take them; time is mapped to the whole grid."""
-        features = planes.lookup(self.levels, self.nodes, 2 * time - 1, self.facts.box)
-        deformation = network.apply_network(self.layers, features)
-        transforms = skinning.transforms(self.nodes, deformation)
+        transforms = self._transforms(self.nodes, time)
         near = self._neighbours(splats.means)
         return skinning.skin(splats, self.nodes, self.log_radii, transforms, near)
+
+    def _transforms(self, nodes: Tensor, time: float) -> Tensor:
+        features = planes.lookup(self.levels, nodes, 2 * time - 1, self.facts.box)
+        return skinning.transforms(nodes, network.apply_network(self.layers, features))
 
     def _neighbours(self, means: Tensor) -> Tensor:
         """Return the nodes that splats follow.
@@ -133,9 +138,20 @@ class NodeMotion:
         self._found_for = None
 
     def penalty(self, splats: Splats, time: float, generator: torch.Generator) -> Tensor | None:
-        """Return the plane regularisers."""
+        """Return the plane regularisers, and the nodes' rigidity at any moment, not only ``time``.
+
+        Nodes are not drawn to where they would be more rigid: only what the grid says of them is.
+        """
         o = self.options
-        return planes.penalty(self.levels, o.space_smoothness, o.time_smoothness, o.time_stillness)
+        value = planes.penalty(self.levels, o.space_smoothness, o.time_smoothness, o.time_stillness)
+        if not o.rigidity:
+            return value
+        nodes = self.nodes.detach()
+        self._pairs = skinning.nearest_nodes(nodes, nodes, self._pairs.to(nodes.device))
+        moment = float(torch.rand((), generator=generator))
+        return value + o.rigidity * skinning.rigidity(
+            nodes, self._transforms(nodes, moment), self._pairs
+        )
 
     def tensors(self) -> dict[str, Tensor]:
         """Return the nodes, their radii, the grid and the network."""

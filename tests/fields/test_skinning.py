@@ -16,6 +16,7 @@ from torch import Tensor
 from gsdmsr_cli.fields.deformation import OUTPUTS
 from gsdmsr_cli.fields.skinning import (
     nearest_nodes,
+    rigidity,
     skin,
     skin_twin,
     spacing,
@@ -68,6 +69,47 @@ def test_nearer_nodes_weigh_more_and_radii_say_by_how_much() -> None:
     moved = skin(splats, nodes, torch.zeros(2), transforms(nodes, deformation), near)
     second = 1 / (1 + math.exp(1.5))
     torch.testing.assert_close(moved.means, torch.tensor([[0.0, 1 - second, second]]))
+
+
+def test_rigid_nodes_are_rigid() -> None:
+    """All of them turn about one axis that is none of theirs, and go on."""
+    nodes, _, _ = nodes_of(30)
+    turn = torch.nn.functional.normalize(torch.tensor([[1.0, 0.2, -0.4, 0.3]]))
+    goes = nodes @ quat_to_rotmat(turn)[0].T + torch.tensor([0.5, -2.0, 1.0])
+    rest = torch.tensor([[1.0, 0.0, 0.0, 0.0]])
+    deformation = torch.cat(
+        [goes - nodes, (turn - rest).expand(30, 4), torch.zeros(30, 3)], dim=1
+    ).requires_grad_()
+    near = nearest_nodes(nodes, nodes, guesses(30, 5))
+    value = rigidity(nodes, transforms(nodes, deformation), near)
+    value.backward()
+    assert 0 <= value < 1e-9
+    assert deformation.grad is not None and deformation.grad.abs().max() < 1e-5
+    bent = deformation.detach().clone()
+    bent[3, 4:7] += 0.1
+    assert rigidity(nodes, transforms(nodes, bent), near) > 1e-5
+
+
+def test_rigidity_is_relative_to_the_distance() -> None:
+    """Two nodes 2 apart, one of which goes 0.3 away: 0.15 squared, in half of the pairs."""
+    nodes = torch.tensor([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0]])
+    deformation = torch.zeros(2, OUTPUTS)
+    deformation[0, 1] = 0.3
+    near = torch.tensor([[0, 1], [0, 1]], dtype=torch.int32)
+    for unit in (1.0, 7.0):
+        deformation[0, 1] = 0.3 * unit
+        value = rigidity(unit * nodes, transforms(unit * nodes, deformation), near)
+        torch.testing.assert_close(value, torch.tensor(0.5 * 0.15**2))
+
+
+def test_nodes_at_one_place_are_rigid_with_each_other() -> None:
+    nodes = torch.tensor([[1.0, 2.0, 3.0], [1.0, 2.0, 3.0], [0.0, 0.0, 0.0]])
+    deformation = torch.zeros(3, OUTPUTS, requires_grad=True)
+    near = torch.tensor([[0, 1], [0, 1], [0, 2]], dtype=torch.int32)
+    value = rigidity(nodes, transforms(nodes, deformation), near)
+    value.backward()
+    assert value == 0
+    assert deformation.grad is not None and not deformation.grad.any()
 
 
 @pytest.mark.parametrize(("count", "kept"), [(0, 4), (1, 1), (333, 4), (200, 20)])

@@ -327,3 +327,18 @@ def test_nodes_follow_splats_that_have_changed_since() -> None:
 def test_nodes_refuse_numbers_out_of_range(options: dict[str, int], found: str) -> None:
     with pytest.raises(UsageError, match=found):
         nodes_of(1, **options)
+
+
+def test_nodes_are_to_move_as_parts_of_a_rigid_body() -> None:
+    """At any moment: of two penalties that differ in their random numbers alone, one is larger."""
+    motion = disturbed(started("nodes", rigidity=2.0, **NO_PLANE_TERMS))
+    first, second = (motion.penalty(splats_of(COUNT), 0.6, generator(seed)) for seed in (1, 2))
+    assert first is not None and second is not None and first > 0 and first != second
+    assert first == motion.penalty(splats_of(COUNT), 0.1, generator(1))
+    names = list(motion.tensors())
+    gradients = torch.autograd.grad(first, list(motion.tensors().values()), allow_unused=True)
+    learnt = {name for name, part in zip(names, gradients, strict=True) if part is not None}
+    assert {name for name in names if name.startswith(("grid", "network"))} <= learnt
+    assert "nodes" not in learnt
+    loose = disturbed(started("nodes", rigidity=0.0, **NO_PLANE_TERMS))
+    assert not loose.penalty(splats_of(COUNT), 0.6, generator())
