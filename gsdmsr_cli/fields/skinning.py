@@ -82,10 +82,18 @@ def transforms(nodes: Tensor, deformation: Tensor) -> Tensor:
         deformation: (M, 10) offset of the place, of the quaternion (1, 0, 0, 0), which is then of
             unit length, and of the log scales.
     """
+    if has_kernels(nodes, deformation):
+        made: Tensor = _Transform.apply(nodes, deformation)
+        return made
+    return transforms_twin(nodes, deformation)
+
+
+def transforms_twin(nodes: Tensor, deformation: Tensor) -> Tensor:
+    """Return what ``transforms`` does, in plain torch, for any device and dtype."""
     offset, turn, growth = deformation.split(PARTS, dim=1)
     nothing = torch.zeros_like(turn)
     nothing[:, 0] = 1
-    quats = torch.nn.functional.normalize(nothing + turn, dim=1)
+    quats = torch.nn.functional.normalize(nothing + turn, dim=1, eps=kernels.SHORTEST)
     matrix = quat_to_rotmat(quats) - torch.eye(3, dtype=turn.dtype, device=turn.device)
     shift = offset - (matrix @ nodes[:, :, None])[:, :, 0]
     return torch.cat([matrix.flatten(1), shift, quats - nothing, growth], dim=1)
@@ -163,6 +171,26 @@ def _product(first: Tensor, second: Tensor) -> Tensor:
         a * z + b * y - c * x + d * w,
     ]
     return torch.stack(parts, dim=1)
+
+
+class _Transform(Function):
+    @staticmethod
+    def forward(ctx: Any, nodes: Tensor, deformation: Tensor) -> Tensor:
+        nodes, deformation = nodes.contiguous(), deformation.contiguous()
+        made = nodes.new_empty(len(nodes), sum(COLUMNS))
+        kernels.transform(*_arrays(nodes, deformation, made))
+        ctx.save_for_backward(nodes, deformation, made)
+        return made
+
+    @staticmethod
+    @once_differentiable  # type: ignore[untyped-decorator]
+    def backward(ctx: Any, given: Tensor) -> tuple[Tensor, Tensor]:
+        nodes, deformation, made = ctx.saved_tensors
+        gradients = torch.empty_like(nodes), torch.empty_like(deformation)
+        kernels.transform_backward(
+            *_arrays(nodes, deformation, made, given.contiguous(), *gradients)
+        )
+        return gradients
 
 
 class _Skin(Function):

@@ -22,6 +22,7 @@ from gsdmsr_cli.fields.skinning import (
     spacing,
     spread_nodes,
     transforms,
+    transforms_twin,
 )
 from gsdmsr_cli.geometry import quat_to_rotmat
 from gsdmsr_cli.splats import Splats
@@ -129,6 +130,23 @@ def test_the_kernel_matches_the_twin(count: int, kept: int) -> None:
         results.append([*parts, *(tensor.grad for tensor in inputs)])
     for i, (found, exact) in enumerate(zip(*results, strict=True)):
         assert_near(found, exact, 1e-5, str(i))
+
+
+def test_the_kernel_of_transforms_matches_the_twin() -> None:
+    """Also where a quaternion is much shorter or longer than 1, or has no length at all."""
+    results = []
+    for make, dtype in ((transforms, torch.float32), (transforms_twin, torch.float64)):
+        places, _, given = nodes_of(40)
+        given[0], given[1, 3:7], given[2, 3:7] = 0.0, 3.0, torch.tensor([-0.99, 0.0, 0.01, 0.0])
+        given[3, 3:7] = torch.tensor([-1.0, 0.0, 0.0, 0.0])
+        nodes, deformation = leaves([places, given], dtype)
+        made = make(nodes, deformation)
+        weights = torch.randn(made.shape, generator=generator(5)).to(dtype)
+        (made * weights).sum().backward()
+        results.append([made, nodes.grad, deformation.grad])
+    for found, expected in zip(*results, strict=True):
+        assert found is not None and expected is not None
+        torch.testing.assert_close(found.double(), expected, rtol=1e-4, atol=1e-4)
 
 
 def test_the_twin_s_gradients_are_those_of_finite_differences() -> None:
