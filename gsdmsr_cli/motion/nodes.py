@@ -55,7 +55,7 @@ class Options:
     space_smoothness: float = 1e-4
     time_smoothness: float = 1e-2
     time_stillness: float = 1e-4
-    rigidity: float = 0.1
+    rigidity: float = 0.05
 
     def __post_init__(self) -> None:
         strict.require(self, "count", self.count > skinning.SPACING_OF, "4 or more")
