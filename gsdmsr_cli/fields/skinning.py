@@ -118,7 +118,7 @@ def rigidity(nodes: Tensor, transforms: Tensor, near: Tensor) -> Tensor:
     apart = places - nodes[:, None]
     taken = apart @ matrix.transpose(1, 2) + offset[:, None]
     squares = apart.square().sum(dim=2)
-    squares = squares.clamp(min=_COINCIDENT * float(squares.mean()))
+    squares = torch.maximum(squares, _COINCIDENT * squares.mean())
     deviations = (taken - goes).square().sum(dim=2)
     return torch.mean(deviations / squares)
 
