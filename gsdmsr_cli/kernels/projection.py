@@ -12,6 +12,7 @@ import math
 from numba import float32, prange
 
 from gsdmsr_cli.kernels.jit import inline, parallel
+from gsdmsr_cli.kernels.rotation import rotation, rotation_backward
 from gsdmsr_cli.splatting_constants import (
     ALPHA_MIN,
     DILATION,
@@ -40,21 +41,6 @@ def _normalised(quats, i):
     a, b, c, d = quats[i, 0], quats[i, 1], quats[i, 2], quats[i, 3]
     n = _ONE / math.sqrt(max(a * a + b * b + c * c + d * d, _TINY))
     return a * n, b * n, c * n, d * n, n
-
-
-@inline
-def _rotation(a, b, c, d):
-    return (
-        _ONE - _TWO * (c * c + d * d),
-        _TWO * (b * c - a * d),
-        _TWO * (b * d + a * c),
-        _TWO * (b * c + a * d),
-        _ONE - _TWO * (b * b + d * d),
-        _TWO * (c * d - a * b),
-        _TWO * (b * d - a * c),
-        _TWO * (c * d + a * b),
-        _ONE - _TWO * (b * b + c * c),
-    )
 
 
 @inline
@@ -143,7 +129,7 @@ def project(
         w00, w01, w02 = fxz * (r00 - u * r20), fxz * (r01 - u * r21), fxz * (r02 - u * r22)
         w10, w11, w12 = fyz * (r10 - v * r20), fyz * (r11 - v * r21), fyz * (r12 - v * r22)
         a, b, c, d, _ = _normalised(quats, i)
-        k00, k01, k02, k10, k11, k12, k20, k21, k22 = _rotation(a, b, c, d)
+        k00, k01, k02, k10, k11, k12, k20, k21, k22 = rotation(a, b, c, d)
         s0, s1, s2 = (
             math.exp(log_scales[i, 0]),
             math.exp(log_scales[i, 1]),
@@ -212,7 +198,7 @@ def project_backward(
         w00, w01, w02 = fxz * (r00 - u * r20), fxz * (r01 - u * r21), fxz * (r02 - u * r22)
         w10, w11, w12 = fyz * (r10 - v * r20), fyz * (r11 - v * r21), fyz * (r12 - v * r22)
         a, b, c, d, n = _normalised(quats, i)
-        k00, k01, k02, k10, k11, k12, k20, k21, k22 = _rotation(a, b, c, d)
+        k00, k01, k02, k10, k11, k12, k20, k21, k22 = rotation(a, b, c, d)
         s0, s1, s2 = (
             math.exp(log_scales[i, 0]),
             math.exp(log_scales[i, 1]),
@@ -245,10 +231,7 @@ def project_backward(
         d00, d10, d20 = d00 * s0, d10 * s0, d20 * s0
         d01, d11, d21 = d01 * s1, d11 * s1, d21 * s1
         d02, d12, d22 = d02 * s2, d12 * s2, d22 * s2
-        qa = _TWO * (d * (d10 - d01) + c * (d02 - d20) + b * (d21 - d12))
-        qb = _TWO * (c * (d10 + d01) + d * (d20 + d02) - _TWO * b * (d11 + d22) + a * (d21 - d12))
-        qc = _TWO * (b * (d10 + d01) + d * (d21 + d12) - _TWO * c * (d00 + d22) + a * (d02 - d20))
-        qd = _TWO * (b * (d20 + d02) + c * (d21 + d12) - _TWO * d * (d00 + d11) + a * (d10 - d01))
+        qa, qb, qc, qd = rotation_backward(a, b, c, d, d00, d01, d02, d10, d11, d12, d20, d21, d22)
         along = qa * a + qb * b + qc * c + qd * d
         d_quats[i, 0], d_quats[i, 1] = (qa - along * a) * n, (qb - along * b) * n
         d_quats[i, 2], d_quats[i, 3] = (qc - along * c) * n, (qd - along * d) * n

@@ -15,6 +15,7 @@ from numba import float32, prange
 
 from gsdmsr_cli.kernels import simd
 from gsdmsr_cli.kernels.jit import inline, parallel, serial
+from gsdmsr_cli.kernels.rotation import rotation, rotation_backward
 
 OFFSET, QUAT, GROWTH, COLUMNS = 9, 12, 16, 19
 """Where the parts of a transform behind its matrix begin, and how many columns it has."""
@@ -24,7 +25,7 @@ SHORTEST = 1e-4
 
 _LANES = simd.LANES
 _BLOCKS = 16
-_ZERO, _HALF, _TWO, _FOUR = float32(0), float32(0.5), float32(2), float32(4)
+_ZERO, _HALF, _ONE = float32(0), float32(0.5), float32(1)
 _SHORTEST = float32(SHORTEST)
 _FAR = float32(1e18)
 _INFINITE = float32(np.inf)
@@ -175,24 +176,10 @@ def nearest(points, nodes, near):
 @inline
 def _turn(deformation, j):
     """Return the quaternion of a node's deformation in unit length, and the length it had."""
-    w, x = float32(1) + deformation[j, 3], deformation[j, 4]
+    w, x = _ONE + deformation[j, 3], deformation[j, 4]
     y, z = deformation[j, 5], deformation[j, 6]
     norm = max(math.sqrt(w * w + x * x + y * y + z * z), _SHORTEST)
     return w / norm, x / norm, y / norm, z / norm, norm
-
-
-@inline
-def _write_matrix(w, x, y, z, transforms, j):
-    """Write a unit quaternion's rotation less the identity."""
-    transforms[j, 0] = -_TWO * (y * y + z * z)
-    transforms[j, 1] = _TWO * (x * y - w * z)
-    transforms[j, 2] = _TWO * (x * z + w * y)
-    transforms[j, 3] = _TWO * (x * y + w * z)
-    transforms[j, 4] = -_TWO * (x * x + z * z)
-    transforms[j, 5] = _TWO * (y * z - w * x)
-    transforms[j, 6] = _TWO * (x * z - w * y)
-    transforms[j, 7] = _TWO * (y * z + w * x)
-    transforms[j, 8] = -_TWO * (x * x + y * y)
 
 
 @serial
@@ -206,14 +193,15 @@ def transform(nodes, deformation, transforms):
     """
     for j in range(nodes.shape[0]):
         w, x, y, z, _ = _turn(deformation, j)
-        _write_matrix(w, x, y, z, transforms, j)
+        for s, entry in enumerate(rotation(w, x, y, z)):
+            transforms[j, s] = entry - _ONE if s % 4 == 0 else entry
         for r in range(3):
             shift = deformation[j, r]
             for s in range(3):
                 shift -= transforms[j, 3 * r + s] * nodes[j, s]
             transforms[j, OFFSET + r] = shift
             transforms[j, GROWTH + r] = deformation[j, 7 + r]
-        transforms[j, QUAT], transforms[j, QUAT + 1] = w - float32(1), x
+        transforms[j, QUAT], transforms[j, QUAT + 1] = w - _ONE, x
         transforms[j, QUAT + 2], transforms[j, QUAT + 3] = y, z
 
 
@@ -238,14 +226,11 @@ def transform_backward(nodes, deformation, transforms, d_transforms, d_nodes, d_
             d_deformation[j, r] = given
             d_deformation[j, 7 + r] = d_transforms[j, GROWTH + r]
         w, x, y, z, norm = _turn(deformation, j)
-        a = _TWO * (x * (m[7] - m[5]) + y * (m[2] - m[6]) + z * (m[3] - m[1]))
-        b = _TWO * (w * (m[7] - m[5]) + y * (m[1] + m[3]) + z * (m[2] + m[6]))
-        c = _TWO * (w * (m[2] - m[6]) + x * (m[1] + m[3]) + z * (m[5] + m[7]))
-        d = _TWO * (w * (m[3] - m[1]) + x * (m[2] + m[6]) + y * (m[5] + m[7]))
-        a += d_transforms[j, QUAT]
-        b += d_transforms[j, QUAT + 1] - _FOUR * x * (m[4] + m[8])
-        c += d_transforms[j, QUAT + 2] - _FOUR * y * (m[0] + m[8])
-        d += d_transforms[j, QUAT + 3] - _FOUR * z * (m[0] + m[4])
+        a, b, c, d = rotation_backward(
+            w, x, y, z, m[0], m[1], m[2], m[3], m[4], m[5], m[6], m[7], m[8]
+        )
+        a, b = a + d_transforms[j, QUAT], b + d_transforms[j, QUAT + 1]
+        c, d = c + d_transforms[j, QUAT + 2], d + d_transforms[j, QUAT + 3]
         along = a * w + b * x + c * y + d * z
         d_deformation[j, 3] = (a - along * w) / norm
         d_deformation[j, 4] = (b - along * x) / norm
