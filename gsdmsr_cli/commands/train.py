@@ -17,7 +17,7 @@ from gsdmsr_cli.commands._progress import progress_bar
 from gsdmsr_cli.commands._training_display import TrainingDisplay
 from gsdmsr_cli.cuda import availability
 from gsdmsr_cli.errors import UsageError
-from gsdmsr_cli.files import write_json
+from gsdmsr_cli.files import sole_writer, write_json
 from gsdmsr_cli.formats import read_scene
 from gsdmsr_cli.kernels.jit import compile_apart, set_threads, threads
 from gsdmsr_cli.motion import motion_options
@@ -70,7 +70,7 @@ def run(
         earlier.check_scene(scene)
     trainer, prepare_s = _timed(lambda: _prepare(scene, options, where))
     timings = {"load_s": load_s + prepare_s}
-    with trainer:
+    with trainer, sole_writer(out):
         if earlier is None:
             name = preset or (config.name if config else "default")
             folder = create_run(out, name, options, trainer.facts, scene, overwrite)

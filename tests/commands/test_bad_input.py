@@ -161,6 +161,18 @@ def test_overwriting_keeps_the_folder_itself(run: Run, tiny_scene: Path) -> None
     assert run.root.stat().st_ino == before and (tiny_scene / "train").is_dir()
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="folders cannot be locked there")
+def test_a_folder_in_which_another_training_writes_is_left_alone(
+    gsdmsr: Gsdmsr, run: Run, tiny_scene: Path, capsys: Any
+) -> None:
+    before = run.checkpoint_path.read_bytes()
+    for how in ("--resume", "--overwrite"):
+        with files.sole_writer(run.root):
+            assert gsdmsr("train", "--data", tiny_scene, "--out", run.root, how) == 3
+        assert "another process is writing there" in one_line(capsys)
+    assert run.checkpoint_path.read_bytes() == before
+
+
 def test_a_full_disk_is_told_before_the_training_not_after_it(
     gsdmsr: Gsdmsr, tiny_scene: Path, tmp_path: Path, capsys: Any, monkeypatch: Any
 ) -> None:
