@@ -6,6 +6,7 @@ import json
 import shlex
 import time
 from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -54,36 +55,42 @@ def run(
         DataError: the data or the run folder cannot be used.
         KeyboardInterrupt: Ctrl-C ended the training; ``out`` holds a checkpoint to go on from.
     """
-    earlier = open_run(out) if resume else None
-    if earlier is None:
-        options = load_preset(preset, config, overrides)
-        motion_options(options.motion)  # told now rather than after the data has been read
-        refuse_used(out, overwrite)
-    else:
-        options = _resumed_options(earlier, preset, config, overrides)
-        checkpoint = earlier.load()
-        _require_rest(earlier, options, checkpoint)
-    where = raster.pick_device(device)
-    _require_precision(options, device, where)
-    scene, load_s = _timed(lambda: _read(data))
-    if earlier is not None:
-        earlier.check_scene(scene)
-    trainer, prepare_s = _timed(lambda: _prepare(scene, options, where))
-    timings = {"load_s": load_s + prepare_s}
-    with trainer, sole_writer(out):
+    with ExitStack() as held:  # the run folder, from before it is read until all is written there
+        there = out.is_dir()
+        if there:
+            held.enter_context(sole_writer(out))
+        earlier = open_run(out) if resume else None
         if earlier is None:
-            name = preset or (config.name if config else "default")
-            folder = create_run(out, name, options, trainer.facts, scene, overwrite)
-            folder.save(trainer.checkpoint())  # a disk without room is told of now, not at the end
+            options = load_preset(preset, config, overrides)
+            motion_options(options.motion)  # told now rather than after the data has been read
+            refuse_used(out, overwrite)
         else:
-            trainer.restore(checkpoint)
-            folder = continue_run(earlier, options, scene)
-            folder.rewind_log(trainer.clock.step)
-        timings["compile_s"] = _start_work(trainer, where)
-        processes = len(trainer.team)
-        with TrainingDisplay() as display:
-            finished = train(trainer, folder, display.show)
-    _write_account(folder, trainer, where, timings, processes)
+            options = _resumed_options(earlier, preset, config, overrides)
+            checkpoint = earlier.load()
+            _require_rest(earlier, options, checkpoint)
+        where = raster.pick_device(device)
+        _require_precision(options, device, where)
+        scene, load_s = _timed(lambda: _read(data))
+        if earlier is not None:
+            earlier.check_scene(scene)
+        trainer, prepare_s = _timed(lambda: _prepare(scene, options, where))
+        timings = {"load_s": load_s + prepare_s}
+        with trainer:
+            if not there:
+                held.enter_context(sole_writer(out))  # made now: bad data leaves no empty folder
+            if earlier is None:
+                name = preset or (config.name if config else "default")
+                folder = create_run(out, name, options, trainer.facts, scene, overwrite)
+                folder.save(trainer.checkpoint())  # a full disk is told of now, not at the end
+            else:
+                trainer.restore(checkpoint)
+                folder = continue_run(earlier, options, scene)
+                folder.rewind_log(trainer.clock.step)
+            timings["compile_s"] = _start_work(trainer, where)
+            processes = len(trainer.team)
+            with TrainingDisplay() as display:
+                finished = train(trainer, folder, display.show)
+        _write_account(folder, trainer, where, timings, processes)
     _say_end(folder, trainer, data, finished)
     if not finished:
         raise KeyboardInterrupt

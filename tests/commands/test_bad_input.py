@@ -173,6 +173,42 @@ def test_a_folder_in_which_another_training_writes_is_left_alone(
     assert run.checkpoint_path.read_bytes() == before
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="folders cannot be locked there")
+@pytest.mark.parametrize("how", ["--resume", "--overwrite"])
+def test_a_training_holds_its_folder_from_the_first_look_to_the_last_word(
+    gsdmsr: Gsdmsr, run: Run, tiny_scene: Path, monkeypatch: Any, how: str
+) -> None:
+    asked: list[str] = []
+
+    def ask(moment: str) -> None:
+        real = getattr(train_command, moment)
+
+        def asking(*given: Any) -> Any:
+            asked.append(moment)
+            with pytest.raises(DataError, match="another process"), files.sole_writer(run.root):
+                pass
+            return real(*given)
+
+        monkeypatch.setattr(train_command, moment, asking)
+
+    first = "open_run" if how == "--resume" else "refuse_used"
+    for moment in (first, "read_scene", "write_json"):
+        ask(moment)
+    few = [part for option in FEW for part in ("--set", option)]
+    options = [*few, "--steps", 1, "--set", "training.threads=1", how]
+    assert gsdmsr("train", "--data", tiny_scene, "--out", run.root, *options) == 0
+    assert asked == [first, "read_scene", "write_json"]
+    with files.sole_writer(run.root):
+        assert run.training_path.is_file()
+
+
+def test_bad_data_leaves_no_folder(gsdmsr: Gsdmsr, tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    (tmp_path / "data").mkdir()
+    assert gsdmsr("train", "--data", tmp_path / "data", "--out", out) == 3
+    assert not out.exists()
+
+
 def test_a_full_disk_is_told_before_the_training_not_after_it(
     gsdmsr: Gsdmsr, tiny_scene: Path, tmp_path: Path, capsys: Any, monkeypatch: Any
 ) -> None:
