@@ -1,18 +1,24 @@
 """COLMAP's part: matches features between frames and maps them; run by ``capture.child``.
 
-Everything is deterministic, whatever the number of threads: frames are numbered before anything
-is written about them, each pair's sampling starts from the seed, and only mapping, whose sums
-depend on their order, has one thread.
+Everything is deterministic, whatever the number of cores: frames are numbered before anything is
+written about them, and each pair's sampling starts from the seed. No process has more than one
+thread for it: sums of mapping depend on their order, and matching calls a BLAS that is built
+without locks (two of its threads may be given the same memory, and once in some hundred captures a
+few matches differed). So the pairs are shared out among processes.
 """
 
 from __future__ import annotations
 
+import os
+import shutil
 import sys
+import threading
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
-from gsdmsr_cli.capture.child import REFUSED, receive_arguments
+from gsdmsr_cli.capture.child import REFUSED, receive_arguments, run_child
 from gsdmsr_cli.capture.failure import why_no_model
 from gsdmsr_cli.capture.features import read_features
 from gsdmsr_cli.capture.masks import read_mask, standing
@@ -21,7 +27,7 @@ from gsdmsr_cli.files import write_json
 from gsdmsr_cli.native import load_pycolmap
 
 PAIRS_AT_ONCE = 40
-"""Pairs that are matched between two words about the progress."""
+"""Pairs that are matched between two words about the progress, and the least for a process."""
 
 DATABASE = "database.db"
 LARGEST = "largest"
@@ -61,19 +67,61 @@ def match(
         image_names=list(names), options=reader,
     )  # fmt: skip
     _write_features(colmap, database, features, masks, focal)
+    for part in _match_apart(Path(out), [(names[i], names[j]) for i, j in pairs], seed):
+        _gather(colmap, database, part / DATABASE)
+        shutil.rmtree(part)
+
+
+def _match_apart(out: Path, pairs: Sequence[tuple[str, str]], seed: int) -> list[Path]:
+    """Match pairs of names, a share in each process; return the folders of their databases."""
+    processes = max(1, min(os.cpu_count() or 1, len(pairs) // PAIRS_AT_ONCE))
+    cuts = [len(pairs) * k // processes for k in range(processes + 1)]
+    done = [0] * processes
+    speaking = threading.Lock()
+
+    def work(index: int) -> Path:
+        def tell(count: int, _: int) -> None:
+            with speaking:
+                done[index] = count
+                _tell(sum(done), len(pairs))
+
+        part = out / f"part{index}"
+        part.mkdir()
+        shutil.copy(out / DATABASE, part)
+        share = pairs[cuts[index] : cuts[index + 1]]
+        run_child("match_share", {"out": str(part), "pairs": share, "seed": seed}, tell)
+        return part
+
+    with ThreadPoolExecutor(processes) as pool:
+        return list(pool.map(work, range(processes)))
+
+
+def match_share(out: str, pairs: Sequence[tuple[str, str]], seed: int) -> None:
+    """Add the matches of pairs of names to the database in ``out``, which has their features."""
+    colmap = load_pycolmap()
     verification = colmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = seed
     for begin in range(0, len(pairs), PAIRS_AT_ONCE):
         chosen = pairs[begin : begin + PAIRS_AT_ONCE]
         listing = Path(out) / "pairs.txt"
-        listing.write_text("".join(f"{names[i]} {names[j]}\n" for i, j in chosen))
+        listing.write_text("".join(f"{first} {second}\n" for first, second in chosen))
         colmap.match_image_pairs(
-            database,
+            Path(out) / DATABASE,
+            matching_options=colmap.FeatureMatchingOptions(num_threads=1),
             pairing_options=colmap.ImportedPairingOptions(match_list_path=listing),
             verification_options=verification,
             device=colmap.Device.cpu,
         )
         _tell(begin + len(chosen), len(pairs))
+
+
+def _gather(colmap: Any, database: Path, part: Path) -> None:
+    """Write to a database what another has found of the same frames."""
+    with colmap.Database.open(database) as opened, colmap.Database.open(part) as found:
+        for pair, matches in zip(*found.read_all_matches(), strict=True):
+            opened.write_matches(*colmap.pair_id_to_image_pair(pair), matches)
+        for pair, geometry in zip(*found.read_two_view_geometries(), strict=True):
+            opened.write_two_view_geometry(*colmap.pair_id_to_image_pair(pair), geometry)
 
 
 def _write_features(
@@ -156,7 +204,11 @@ def _tell(done: int, total: int) -> None:
 def main() -> None:
     """Do the job that the command line names, with the arguments that come by stdin."""
     job, arguments = sys.argv[1], receive_arguments()
-    jobs: dict[str, Callable[..., None]] = {"match": match, "map": map_frames}
+    jobs: dict[str, Callable[..., None]] = {
+        "match": match,
+        "match_share": match_share,
+        "map": map_frames,
+    }
     try:
         jobs[job](**arguments)
     except DataError as error:

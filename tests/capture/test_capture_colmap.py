@@ -12,9 +12,11 @@ import room
 from hypothesis import given
 from hypothesis import strategies as st
 
+from gsdmsr_cli.capture import colmap as colmap_jobs
 from gsdmsr_cli.capture.child import run_child
+from gsdmsr_cli.capture.colmap import DATABASE
 from gsdmsr_cli.capture.consistency import essential_matrix, rays_of, sampson_distance
-from gsdmsr_cli.capture.features import find_features
+from gsdmsr_cli.capture.features import find_features, write_features
 from gsdmsr_cli.capture.options import CAMERA_MODELS, MATCHINGS
 from gsdmsr_cli.capture.pairs import NEIGHBOURS, choose_pairs
 from gsdmsr_cli.capture.reconstruction import lens_of
@@ -108,3 +110,36 @@ def test_a_job_may_have_more_arguments_than_fit_a_command_line(tmp_path: Path) -
     rest = {"camera_model": "PINHOLE", "focal": None, "pairs": pairs, "seed": 0}
     with pytest.raises(GsdmsrError, match="COLMAP has failed in its job match"):
         run_child("match", {"out": str(tmp_path), **nothing, **rest}, lambda done, total: None)
+
+
+def test_the_number_of_cores_changes_no_match(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pictures = room.write_pictures(tmp_path / "pictures", room.film(room.walk(14)[:6]))
+    paths = sorted(pictures.iterdir())
+    write_features(pictures, paths, 500, lambda done, total: None)
+    monkeypatch.setattr(colmap_jobs, "PAIRS_AT_ONCE", 4)
+    pairs = choose_pairs(6, "exhaustive", False)
+    found = []
+    for cores in (1, 3):
+        monkeypatch.setattr(colmap_jobs.os, "cpu_count", lambda cores=cores: cores)
+        out = tmp_path / str(cores)
+        out.mkdir()
+        names = [path.name for path in paths]
+        given = str(pictures), names, str(pictures), None, "PINHOLE", None
+        colmap_jobs.match(str(out), *given, pairs, seed=0)
+        assert capsys.readouterr().out.endswith("progress 15 15\n")
+        assert not any(entry.is_dir() for entry in out.iterdir())
+        with load_pycolmap().Database.open(out / DATABASE) as database:
+            matches = dict(zip(*database.read_all_matches(), strict=True))
+            verified = dict(zip(*database.read_two_view_geometries(), strict=True))
+        found.append((matches, verified))
+    (matches, verified), (shared, shared_verified) = found
+    assert matches.keys() == shared.keys() and len(verified) > 10
+    assert verified.keys() == shared_verified.keys()
+    for pair, rows in matches.items():
+        np.testing.assert_array_equal(rows, shared[pair])
+    for pair, geometry in verified.items():
+        other = shared_verified[pair]
+        np.testing.assert_array_equal(geometry.inlier_matches, other.inlier_matches)
+        np.testing.assert_array_equal(geometry.F, other.F)
