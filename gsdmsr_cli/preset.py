@@ -214,6 +214,9 @@ class DensityOptions:
         prune_opacity: a splat below this opacity is pruned.
         reset_at: progress of each opacity reset.
         cap: most splats there may be.
+        thin_at: progress of each thinning, after which the splats that the pictures depend on least
+            are gone, see ``training.sensitivity``.
+        thin_share: share of the splats that a thinning takes.
     """
 
     every: int = 100
@@ -226,6 +229,8 @@ class DensityOptions:
     prune_opacity: float = 0.005
     reset_at: tuple[float, ...] = (0.12,)
     cap: int = 100000
+    thin_at: tuple[float, ...] = ()
+    thin_share: float = 0.3
 
     def __post_init__(self) -> None:
         _require_at_least(self, 1, "every", "rounds", "cap")
@@ -233,8 +238,10 @@ class DensityOptions:
         _require_progress(self, "until")
         _require_positive(self, "gradient", "split_scale", "prune_scale")
         require(self, "prune_opacity", 0.0 <= self.prune_opacity < 1.0, "0 or more, below 1")
-        ok = all(0.0 <= progress <= 1.0 for progress in self.reset_at)
-        require(self, "reset_at", ok, f"a list, each item {_PROGRESS}")
+        require(self, "thin_share", 0.0 <= self.thin_share < 1.0, "0 or more, below 1")
+        for key in ("reset_at", "thin_at"):
+            ok = all(0.0 <= progress <= 1.0 for progress in getattr(self, key))
+            require(self, key, ok, f"a list, each item {_PROGRESS}")
 
 
 @dataclass(frozen=True)

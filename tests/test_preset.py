@@ -223,6 +223,8 @@ def test_a_malformed_override_is_refused(override: str) -> None:
         "density.gradient=0",
         "density.prune_opacity=1",
         "density.reset_at=[0.1, 2]",
+        "density.thin_at=[0.5, 2]",
+        "density.thin_share=1",
         "density.cap=0",
         "motion={depth: 2}",
         "motion.name=3",

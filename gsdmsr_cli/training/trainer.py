@@ -25,6 +25,7 @@ from gsdmsr_cli.training.look import Look, Observer, Stage
 from gsdmsr_cli.training.optimizer import Adam, Gate
 from gsdmsr_cli.training.saliency import Saliency, step_saliency
 from gsdmsr_cli.training.schedule import log_linear, new_clock
+from gsdmsr_cli.training.sensitivity import MOST_VIEWS, most_sensitive, picture_sensitivity
 from gsdmsr_cli.training.stages import Stopwatch
 from gsdmsr_cli.training.state import Part, below, gather, scatter
 from gsdmsr_cli.training.stillness import motion_saliency
@@ -89,7 +90,7 @@ class Trainer:
         self.clock = new_clock(preset.training)
         self.stopwatch = Stopwatch()
         self._queue: list[int] = []
-        self._rounds = self._resets = 0
+        self._rounds = self._resets = self._thinnings = 0
         self._moving = False
         self._skipped = 0
 
@@ -282,6 +283,21 @@ class Trainer:
             self.optimizer.forget(STORED_AS + "logit_opacities")
             self.average.forget()
             self.saliency.pardon(torch.ones_like(self.saliency.high))
+        if self._thinnings < len(options.thin_at) and progress >= options.thin_at[self._thinnings]:
+            self._thinnings += 1
+            self._thin()
+
+    def _thin(self) -> None:
+        """Prune the splats that the training's pictures depend on least."""
+        chosen = torch.randperm(len(self.views), generator=self.generator)[:MOST_VIEWS]
+        views = [self.views[row] for row in chosen.tolist()]
+        shots = [(self.observer.pictures.camera(view), view.time) for view in views]
+        given = self.observer.engine, shots, self.observer.background, self.generator
+        with self.team.all_threads():
+            scores = picture_sensitivity(self.model, *given)
+        rows = most_sensitive(scores, self.preset.density.thin_share)
+        self.model.take(rows)
+        self._follow(rows, torch.zeros_like(rows, dtype=torch.bool))
 
     def _root(self) -> None:
         """Tie the motion to the present splats, if it moves them and cares where they are."""
@@ -366,6 +382,7 @@ class Trainer:
             "queue": self._queue,
             "rounds": self._rounds,
             "resets": self._resets,
+            "thinnings": self._thinnings,
             "moving": self._moving,
             "adam_steps": self.optimizer.steps,
             "averaged": self.average.count,
@@ -392,6 +409,7 @@ class Trainer:
         self.generator.set_state(tensors["generator"])
         self._queue = list(state["queue"])
         self._rounds, self._resets = int(state["rounds"]), int(state["resets"])
+        self._thinnings = int(state.get("thinnings", 0))  # absent before there was such a thing
         self._moving = bool(state["moving"])
         self.clock.step, self.clock.before = checkpoint.step, checkpoint.elapsed
 
