@@ -19,6 +19,9 @@ REFUSED = 3
 DISK = ("disk", "no space", "file too large", "filesystem error", "i/o error")
 """Words by which SQLite and COLMAP tell that a file could not be written."""
 
+FAILED = "COLMAP has failed in its job"
+"""How the message of a job's failure begins."""
+
 ONE_THREAD = {"OMP_NUM_THREADS": "1"}
 """COLMAP has threads of its own where they do no harm; OpenMP's come and go with the load."""
 
@@ -81,7 +84,9 @@ def _failure(job: str, lines: list[str], code: int) -> GsdmsrError:
                 "is finished is kept"
             )
     reason = lines[-1] if lines else f"exit code {code}"
-    return GsdmsrError(f"COLMAP has failed in its job {job}: {reason}")
+    if reason.startswith(FAILED):  # in a child of that child
+        return GsdmsrError(reason)
+    return GsdmsrError(f"{FAILED} {job}: {reason}")
 
 
 def receive_arguments() -> dict[str, Any]:

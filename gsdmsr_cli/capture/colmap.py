@@ -22,7 +22,7 @@ from gsdmsr_cli.capture.child import REFUSED, receive_arguments, run_child
 from gsdmsr_cli.capture.failure import why_no_model
 from gsdmsr_cli.capture.features import read_features
 from gsdmsr_cli.capture.masks import read_mask, standing
-from gsdmsr_cli.errors import DataError
+from gsdmsr_cli.errors import DataError, GsdmsrError
 from gsdmsr_cli.files import write_json
 from gsdmsr_cli.native import load_pycolmap
 
@@ -214,6 +214,8 @@ def main() -> None:
     except DataError as error:
         print(error, flush=True)
         sys.exit(REFUSED)
+    except GsdmsrError as error:  # of a child's child
+        sys.exit(str(error))
 
 
 if __name__ == "__main__":

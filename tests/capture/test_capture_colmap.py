@@ -143,3 +143,17 @@ def test_the_number_of_cores_changes_no_match(
         other = shared_verified[pair]
         np.testing.assert_array_equal(geometry.inlier_matches, other.inlier_matches)
         np.testing.assert_array_equal(geometry.F, other.F)
+
+
+def test_the_failure_of_a_share_is_told_once(tmp_path: Path) -> None:
+    """A seed that is no number is noticed in a child of the child."""
+    pictures = room.write_pictures(tmp_path / "pictures", room.film(room.walk(14)[:2]))
+    paths = sorted(pictures.iterdir())
+    write_features(tmp_path, paths, 100, lambda done, total: None)
+    (tmp_path / "out").mkdir()
+    given = {"out": str(tmp_path / "out"), "pictures": str(pictures), "features": str(tmp_path)}
+    rest = {"masks": None, "camera_model": "PINHOLE", "focal": None, "seed": "none"}
+    names = [path.name for path in paths]
+    with pytest.raises(GsdmsrError, match=r"^COLMAP has failed in its job match_share: ") as failed:
+        run_child("match", {**given, **rest, "names": names, "pairs": [[0, 1]]}, lambda *_: None)
+    assert str(failed.value).count("has failed") == 1
