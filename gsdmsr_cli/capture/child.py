@@ -23,7 +23,7 @@ FAILED = "COLMAP has failed in its job"
 """How the message of a job's failure begins."""
 
 ONE_THREAD = {"OMP_NUM_THREADS": "1"}
-"""COLMAP has threads of its own where they do no harm; OpenMP's come and go with the load."""
+"""OpenMP's threads come and go with the load, and what is found would change with them."""
 
 
 def run_child(job: str, arguments: Mapping[str, Any], tell: Callable[[int, int], None]) -> None:
