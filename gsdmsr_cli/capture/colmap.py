@@ -3,8 +3,8 @@
 Everything is deterministic, whatever the number of cores: frames are numbered before anything is
 written about them, and each pair's sampling starts from the seed. No process has more than one
 thread for it: sums of mapping depend on their order, and matching calls a BLAS that is built
-without locks (two of its threads may be given the same memory, and once in some hundred captures a
-few matches differed). So the pairs are shared out among processes.
+without locks: two of its threads may be given the same memory, and then a few matches differ. So
+the pairs are shared out among processes.
 """
 
 from __future__ import annotations

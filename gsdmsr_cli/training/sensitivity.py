@@ -15,10 +15,9 @@ from torch import Tensor
 from gsdmsr_cli.camera import Camera
 from gsdmsr_cli.model import Model
 from gsdmsr_cli.raster import Engine
-from gsdmsr_cli.splats import Splats
 
 MOST_VIEWS = 60
-"""Views that are enough to tell; a short capture has fewer."""
+"""Views that are looked at; a capture with more is sampled."""
 
 
 def picture_sensitivity(
@@ -45,14 +44,12 @@ def picture_sensitivity(
     total = torch.zeros(len(model.splats), device=background.device)
     for camera, time in shots:
         with torch.no_grad():
-            moment = model.at(time)
-        leaf = Splats(**{n: t.detach().requires_grad_() for n, t in moment.tensors().items()})
-        picture = engine.rasterize(leaf, camera, background).rgb
+            moment = model.at(time).detach()
+        asked = [moment.means.requires_grad_(), moment.log_scales.requires_grad_()]
+        picture = engine.rasterize(moment, camera, background).rgb
         signs = 2 * torch.randint(0, 2, picture.shape, generator=generator) - 1
-        means, log_scales = torch.autograd.grad(
-            picture, [leaf.means, leaf.log_scales], signs.to(picture)
-        )
-        sizes = moment.log_scales.exp()
+        means, log_scales = torch.autograd.grad(picture, asked, signs.to(picture))
+        sizes = moment.log_scales.detach().exp()
         total += (means * sizes).square().sum(dim=1) + log_scales.square().sum(dim=1)
     return total
 

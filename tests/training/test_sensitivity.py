@@ -100,7 +100,8 @@ def losses_and_counts(trainer: Trainer, steps: int) -> list[tuple[float, int]]:
 
 
 def test_a_training_is_thinned_when_it_is_told(tiny_scene: Path) -> None:
-    counts = [count for _, count in losses_and_counts(trainer_of(tiny_scene, preset_of(*THIN)), 40)]
+    trainer = trainer_of(tiny_scene, preset_of(*THIN))
+    counts = [count for _, count in losses_and_counts(trainer, STEPS)]
     at = [STEPS * 3 // 10, STEPS * 6 // 10]  # the steps that begin there
     assert counts[at[0]] == counts[at[0] - 1] - counts[at[0] - 1] // 4
     assert counts[at[1]] == counts[at[1] - 1] - counts[at[1] - 1] // 4
