@@ -2,7 +2,7 @@
 
 import os
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 # Where OpenMP runs the kernels its threads must not spin between them: on few cores they starve
 # each other (8 ms a launch instead of 0.04 on two). The runtime reads this once, when it is loaded.

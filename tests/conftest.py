@@ -9,8 +9,8 @@ from pathlib import Path
 import cuda_shim
 import pytest
 
-from gsdmsr_cli.cuda import availability
-from gsdmsr_cli.synthetic import write_scene
+from gsdmsr_cli.backends.cuda import availability
+from gsdmsr_cli.demo.synthetic import write_scene
 
 
 @pytest.fixture(scope="session")

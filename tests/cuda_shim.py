@@ -12,9 +12,9 @@ from pathlib import Path
 
 import torch
 
-from gsdmsr_cli.cuda import compiler, launch
+from gsdmsr_cli.backends.cuda import compiler, launch
 
-SHIM = Path(__file__).parent / "cuda" / "shim"
+SHIM = Path(__file__).parent / "backends" / "cuda" / "shim"
 MISSING = None if shutil.which("g++") else "there is no g++ to build the kernels for the CPU with"
 _INCLUDED = re.compile(r'#include "(\w+\.cuh)"')
 _KERNEL = re.compile(r'extern "C" __global__ void (?:__launch_bounds__\([^)]*\) )?(\w+)\(')
@@ -22,8 +22,8 @@ _KERNEL = re.compile(r'extern "C" __global__ void (?:__launch_bounds__\([^)]*\) 
 
 def kernels_of(source: str) -> list[str]:
     """Return the names of the kernels of a source and of what it includes."""
-    text = (compiler.HERE / f"{source}.cu").read_text(encoding="utf-8")
-    included = [compiler.HERE / name for name in _INCLUDED.findall(text)]
+    text, headers = compiler.source_path(source).read_text(encoding="utf-8"), compiler.headers()
+    included = [headers[name] for name in _INCLUDED.findall(text)]
     return _KERNEL.findall(text + "".join(path.read_text(encoding="utf-8") for path in included))
 
 
@@ -70,7 +70,10 @@ class Shim:
         program.write_text(text, encoding="utf-8")
         macros = [f"-D{name}={value}" for name, value in compiler.definitions().items()]
         line = ["g++", "-std=c++17", "-O2", "-shared", "-fPIC", "-U_FORTIFY_SOURCE", "-w"]
-        places = [f"-I{SHIM}", f"-I{compiler.HERE}", "-o", str(library), str(program)]
+        folders = {compiler.source_path(source).parent}
+        folders |= {path.parent for path in compiler.headers().values()}
+        places = [f"-I{folder}" for folder in (SHIM, *sorted(folders))]
+        places += ["-o", str(library), str(program)]
         done = subprocess.run(
             [*line, *macros, *places], capture_output=True, text=True, check=False
         )

@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from gsdmsr_cli.kernels.jit import threads
+from gsdmsr_cli.backends.cpu.jit import threads
 
 
 def generator(seed: int = 0) -> torch.Generator:

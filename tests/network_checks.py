@@ -8,7 +8,7 @@ import torch
 from kernel_checks import generator
 from torch import Tensor
 
-from gsdmsr_cli.fields.network import Layer
+from gsdmsr_cli.ops.network import Layer
 
 
 def tensors_of(widths: list[int], seed: int = 0) -> list[Tensor]:

@@ -63,6 +63,6 @@ def small_report() -> dict[str, Any]:
             "splats": 1234,
             "load_s": 2.5,
             "compile_s": 0.5,
-            "stages_s": {"look": 60.0, "learn": 30.0, "grow": 2.0, "other": 5.25},
+            "stages_s": {"gradients": 60.0, "optimizer": 30.0, "population": 2.0, "other": 5.25},
         },
     }

@@ -6,6 +6,7 @@ import importlib
 import re
 import sys
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -15,20 +16,29 @@ import pytest
 import torch
 from datasets import noise, write_json, write_picture
 from kernel_checks import generator
+from motion_checks import started
+from seam_checks import assert_trains_the_same_in_all_ways
+from training_checks import STEPS, preset_of, trainer_of
 
-from gsdmsr_cli import formats, paths, plugins
-from gsdmsr_cli import motion as motions
-from gsdmsr_cli.errors import DataError, UsageError
-from gsdmsr_cli.fields.planes import CUBE
-from gsdmsr_cli.film import PathOptions
+from gsdmsr_cli import exports, formats, ops, paths, raster
+from gsdmsr_cli.demo.synthetic import write_scene
 from gsdmsr_cli.formats import dnerf, read_scene
-from gsdmsr_cli.model import Model, load_model
-from gsdmsr_cli.motion import Facts, start_motion
-from gsdmsr_cli.pictures import Pictures
-from gsdmsr_cli.preset import load_preset
+from gsdmsr_cli.gaussians.moment import Moment
+from gsdmsr_cli.gaussians.splats import Splats
+from gsdmsr_cli.ground import plugins
+from gsdmsr_cli.ground.errors import DataError, UsageError
+from gsdmsr_cli.model import layers
+from gsdmsr_cli.model import motion as motions
+from gsdmsr_cli.model.building import load_model, start_model
+from gsdmsr_cli.model.layer import Facts, Instant
+from gsdmsr_cli.model.model import Model
+from gsdmsr_cli.ops.planes import CUBE
+from gsdmsr_cli.options.preset import load_preset
+from gsdmsr_cli.options.strict import Located
 from gsdmsr_cli.raster import best_engine
-from gsdmsr_cli.splats import Splats
-from gsdmsr_cli.synthetic import write_scene
+from gsdmsr_cli.scene.film import PathOptions
+from gsdmsr_cli.scene.pictures import Pictures
+from gsdmsr_cli.training import losses, population
 from gsdmsr_cli.training.trainer import Trainer
 
 ROOT = Path(__file__).parent.parent
@@ -38,17 +48,17 @@ COMMANDS = (
 )  # fmt: skip
 
 
-def example(page: str) -> str:
-    """Return the first block of Python in a page."""
+def examples(page: str) -> list[str]:
+    """Return the blocks of Python in a page."""
     text = (ROOT / "docs" / page).read_text(encoding="utf-8")
-    found = re.search(r"^```python\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
+    found = re.findall(r"^```python\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
     assert found, page
-    return found[1]
+    return found
 
 
 def installed(package: ModuleType, name: str, page: str, folder: Path) -> Iterator[ModuleType]:
     """Put the page's example into a package, as if its file lay there, and yield the module."""
-    (folder / f"{name}.py").write_text(example(page), encoding="utf-8")
+    (folder / f"{name}.py").write_text(examples(page)[0], encoding="utf-8")
     package.__path__.append(str(folder))
     importlib.invalidate_caches()
     try:
@@ -73,6 +83,157 @@ def swing(tmp_path: Path) -> Iterator[ModuleType]:
     yield from installed(paths, "swing", "adding-a-path.md", tmp_path)
 
 
+@pytest.fixture
+def splat(tmp_path: Path) -> Iterator[ModuleType]:
+    yield from installed(exports, "splat", "adding-an-export.md", tmp_path)
+
+
+@pytest.fixture
+def brightness(tmp_path: Path) -> Iterator[ModuleType]:
+    yield from installed(layers, "brightness", "adding-a-layer.md", tmp_path)
+
+
+@pytest.fixture
+def sparsity(tmp_path: Path) -> Iterator[ModuleType]:
+    yield from installed(losses, "sparsity", "adding-a-loss.md", tmp_path)
+
+
+@pytest.fixture
+def duplicate(tmp_path: Path) -> Iterator[ModuleType]:
+    yield from installed(population, "duplicate", "adding-an-event.md", tmp_path)
+
+
+@pytest.fixture
+def plain(tmp_path: Path) -> Iterator[ModuleType]:
+    yield from installed(raster, "plain", "adding-an-engine.md", tmp_path)
+
+
+@pytest.fixture
+def temporal_opacity(tmp_path: Path) -> Iterator[ModuleType]:
+    """The example of an operation: a folder of three files."""
+    folder, name = tmp_path / "temporal_opacity", "gsdmsr_cli.ops.temporal_opacity"
+    folder.mkdir()
+    files = ("__init__.py", "twin.py", "cpu.py")
+    for file, text in zip(files, examples("adding-an-op.md"), strict=True):
+        (folder / file).write_text(text, encoding="utf-8")
+    ops.__path__.append(str(tmp_path))
+    importlib.invalidate_caches()
+    try:
+        yield importlib.import_module(name)
+    finally:
+        ops.__path__.remove(str(tmp_path))
+        for module in [m for m in sys.modules if m == name or m.startswith(f"{name}.")]:
+            del sys.modules[module]
+
+
+def test_the_example_of_a_layer_brightens_and_trains(
+    brightness: ModuleType, tiny_scene: Path, tmp_path: Path
+) -> None:
+    options = "layers=[{name: brightness, keyframes: 3}]"
+    trainer = assert_trains_the_same_in_all_ways(tiny_scene, tmp_path, options)
+    layer = trainer.model.layers["layers.brightness"]
+    assert trainer.model.tensors()["layers.brightness.offsets"].any()
+    with torch.no_grad():
+        layer.tensors()["offsets"].copy_(torch.tensor([1.0, 2.0, 4.0]))
+    splats = splats_of(4)
+    for time, offset in [(0.0, 1.0), (0.25, 1.5), (0.75, 3.0), (1.0, 4.0)]:
+        found = layer.at(Moment(splats), Instant(time)).splats
+        torch.testing.assert_close(found.sh, splats.sh + offset)
+        assert torch.equal(found.means, splats.means)
+    with pytest.raises(UsageError, match="keyframes is 1; allowed: 2 or more"):
+        trainer_of(tiny_scene, preset_of("layers=[{name: brightness, keyframes: 1}]"))
+
+
+def test_the_example_of_a_term_makes_splats_transparent(
+    sparsity: ModuleType, tiny_scene: Path, tmp_path: Path
+) -> None:
+    terms = "losses.terms=[{{name: sparsity, factor: {}, until: 0.5}}]"
+    assert_trains_the_same_in_all_ways(tiny_scene, tmp_path, terms.format(0.01))
+    (term,) = trainer_of(tiny_scene, preset_of(terms.format(0.3))).renderer.terms
+    assert [term.weight(progress) for progress in (0.0, 0.49, 0.5)] == [0.3, 0.3, 0.0]
+    means = []
+    for factor in (0.0, 10.0):
+        trainer = trainer_of(tiny_scene, preset_of(terms.format(factor), "density.reset_at=[]"))
+        for _ in range(STEPS // 2):
+            trainer.step()
+        means.append(float(trainer.model.splats.logit_opacities.detach().sigmoid().mean()))
+    assert means[1] < 0.8 * means[0]
+
+
+def test_the_example_of_an_event_copies_splats(
+    duplicate: ModuleType, tiny_scene: Path, tmp_path: Path
+) -> None:
+    own = "{name: duplicate, count: 7, every: 10, most: 3}"
+    options = f"events=[density, opacity_reset, {own}]", "density.gradient=1.0"
+    unpruned = "density.prune_opacity=0.0", "density.prune_scale=1000000.0"
+    trainer = assert_trains_the_same_in_all_ways(tiny_scene, tmp_path, *options, *unpruned)
+    assert len(trainer.model.splats) == 120 + 3 * 7
+    assert trainer.checkpoint().state["events"]["duplicate"] == {"times": 3}
+
+
+def test_the_example_of_an_operation_is_its_twin(temporal_opacity: ModuleType) -> None:
+    for count in (0, 1, 37):
+        rng = generator(count)
+        given = [torch.randn(count, generator=rng) for _ in range(3)]
+        weights = torch.randn(count, generator=rng)
+        outcomes = []
+        for dtype in (torch.float32, torch.float64):
+            leaves = [tensor.to(dtype).requires_grad_() for tensor in given]
+            faded = temporal_opacity.temporal_opacity(*leaves, 0.3)
+            gradients = torch.autograd.grad((faded * weights.to(dtype)).sum(), leaves)
+            outcomes.append([faded.detach(), *gradients])
+            assert type(faded.grad_fn).__name__.startswith("_Temp") == (dtype == torch.float32)
+        for found, exact in zip(*outcomes, strict=True):
+            torch.testing.assert_close(found, exact.float(), rtol=1e-5, atol=1e-5)
+    leaves = [tensor.double().requires_grad_() for tensor in given]
+    assert torch.autograd.gradcheck(lambda *t: temporal_opacity.temporal_opacity(*t, 0.3), leaves)
+
+
+def test_the_example_of_an_engine_conforms(
+    plain: ModuleType, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(ROOT / "tests" / "raster")
+    conformance, scenes = map(importlib.import_module, ("test_conformance", "raster_scenes"))
+    monkeypatch.setattr(raster, "FASTEST_FIRST", (*raster.FASTEST_FIRST, "plain"))
+    assert raster.engine_names()[-1] == "plain"
+    engine = raster.load_engine("plain")
+    assert engine.unavailable("cpu") is None and engine.unavailable("cuda") is not None
+    placed = engine, "cpu"
+    for name in ("saturated", "behind and at the near plane", *sorted(scenes.WITH_FEATURES)[:2]):
+        conformance.test_pictures_match_the_reference(placed, name)
+        conformance.test_gradients_match_the_reference(placed, name)
+        conformance.test_radii_and_screen_means_match_the_reference(placed, name)
+    for rows in (scenes.poisoned, scenes.poisoned_moment):
+        conformance.test_rows_that_are_not_finite_are_as_if_absent(placed, rows)
+
+
+def test_the_example_of_an_export_writes_and_refuses(splat: ModuleType, tmp_path: Path) -> None:
+    model = Model(splats_of(5), {"motion": started("static", 5)})
+    facts, out = Facts(1.3, CUBE, 10), tmp_path / "made" / "a.splat"
+    assert exports.format_names() == ["ply", "ply-sequence", "splat"]
+    out.parent.mkdir()
+    assert exports.export("splat", model, facts, Located({"time": 0.5}), out) == [out]
+    kinds = [("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("quats", "u1", 4)]
+    rows, splats = np.frombuffer(out.read_bytes(), kinds), model.splats.detach()
+    np.testing.assert_array_equal(rows["means"], splats.means)
+    np.testing.assert_allclose(rows["scales"], np.exp(splats.log_scales.numpy()), rtol=1e-6)
+    opacities = 1 / (1 + np.exp(-splats.logit_opacities.numpy()))
+    np.testing.assert_allclose(rows["rgba"][:, 3] / 255, opacities, atol=0.5 / 255 + 1e-6)
+    colours = np.clip(0.5 + 0.28209479177387814 * splats.sh[:, 0].numpy(), 0, 1)
+    np.testing.assert_allclose(rows["rgba"][:, :3] / 255, colours, atol=0.5 / 255 + 1e-6)
+    units = splats.quats / splats.quats.norm(dim=1, keepdim=True)
+    np.testing.assert_allclose((rows["quats"] - 128.0) / 128, units, atol=1 / 128 + 1e-6)
+    harmonics = torch.cat([splats.sh, splats.sh, splats.sh, splats.sh], dim=1)
+    shaded = Model(replace(splats, sh=harmonics), {"motion": started("static", 5)})
+    with pytest.raises(UsageError, match="--format splat cannot carry colours that depend"):
+        exports.export("splat", shaded, facts, Located(), tmp_path / "b.splat")
+    assert not (tmp_path / "b.splat").exists()
+    (path,) = exports.export("splat", shaded, facts, Located({"mean_colour": True}), out)
+    assert path.read_bytes() == rows.tobytes()
+    with pytest.raises(UsageError, match="frames is not for --format splat, which takes time"):
+        exports.export("splat", model, facts, Located({"frames": 2}), out)
+
+
 def test_the_example_of_a_path_swings(swing: ModuleType, tiny_scene: Path) -> None:
     scene = read_scene(tiny_scene)
     shots = paths.make_film(scene, "swing", PathOptions(9)).shots
@@ -92,33 +253,46 @@ def splats_of(count: int) -> Splats:
     return Splats(**{n: torch.randn(count, *shape, generator=rng) for n, shape in shapes.items()})
 
 
-def started(settings: dict[str, Any], count: int) -> Any:
-    return start_motion(settings, Facts(1.3, CUBE, 10), count, generator())
+FACTS = Facts(1.3, CUBE, 10)
+
+
+def model_of(settings: dict[str, Any], count: int) -> Model:
+    return start_model(splats_of(count), settings, (), FACTS, generator())
 
 
 def test_the_example_of_a_motion_keeps_to_the_rules(linear: ModuleType) -> None:
-    splats, motion = splats_of(5), started({"name": "linear"}, 5)
-    assert torch.equal(motion.at(splats, 0.9).means, splats.means)
+    model = model_of({"name": "linear"}, 5)
+    splats, motion = splats_of(5), model.layers["motion"]
+
+    def moved_to(time: float, splats: Splats) -> Splats:
+        return motion.at(Moment(splats), Instant(time)).splats
+
+    assert motion.identity_at_start
+    assert torch.equal(moved_to(0.9, splats).means, splats.means)
+    velocities = model.tensors()["motion.velocities"]
     with torch.no_grad():
-        motion.velocities += torch.arange(15.0).reshape(5, 3)
-    moved = motion.at(splats, 1.0)
-    torch.testing.assert_close(moved.means, splats.means + 0.5 * motion.velocities)
-    assert motion.penalty(splats, 0.5, torch.Generator()) > 0
+        velocities += torch.arange(15.0).reshape(5, 3)
+    moved = moved_to(1.0, splats)
+    torch.testing.assert_close(moved.means, splats.means + 0.5 * velocities)
+    penalty = motion.penalty(Moment(splats), Instant(0.5), torch.Generator())
+    assert penalty is not None and penalty > 0
     rows = torch.tensor([4, 0, 0])
-    motion.take(rows)
-    assert torch.equal(motion.at(splats.take(rows), 1.0).means, moved.means[rows])
+    motion.take(rows, torch.tensor([False, False, True]))
+    assert torch.equal(moved_to(1.0, splats.take(rows)).means, moved.means[rows])
     with pytest.raises(UsageError, match="slownes"):
-        started({"name": "linear", "slownes": 1.0}, 5)
+        model_of({"name": "linear", "slownes": 1.0}, 5)
 
 
 def test_the_example_of_a_motion_is_saved_and_loaded(linear: ModuleType) -> None:
-    model = Model(splats_of(5), started({"name": "linear"}, 5))
+    model = model_of({"name": "linear"}, 5)
     with torch.no_grad():
         model.tensors()["motion.velocities"].normal_(generator=generator())
-    model.take(torch.tensor([1, 1, 3]))
+    model.take(torch.tensor([1, 1, 3]), torch.tensor([False, True, False]))
     tensors = {name: tensor.detach().clone() for name, tensor in model.tensors().items()}
-    loaded = load_model(tensors, {"name": "linear"}, Facts(1.3, CUBE, 10), 1.0)
-    assert torch.equal(loaded.at(0.2).means, model.at(0.2).means)
+    loaded = load_model(tensors, {"name": "linear"}, (), FACTS, 1.0)
+    found, expected = (one.at(one.instant(0.2)).splats for one in (loaded, model))
+    assert torch.equal(found.means, expected.means)
+    assert not torch.equal(found.means, model.splats.means)
 
 
 def test_the_example_of_a_motion_trains_and_grows(linear: ModuleType, tmp_path: Path) -> None:
@@ -198,17 +372,25 @@ def test_links_between_pages_lead_somewhere(page: Path) -> None:
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_paths_of_the_package_that_pages_name_exist(page: Path) -> None:
-    examples = {f"gsdmsr_cli/{n}.py" for n in ("motion/linear", "formats/turntable", "paths/swing")}
+    made = {
+        f"gsdmsr_cli/{name}.py"
+        for name in (
+            "model/motion/linear", "model/layers/brightness", "formats/turntable", "paths/swing",
+            "exports/splat", "training/losses/sparsity", "training/population/duplicate",
+            "raster/plain", "ops/temporal_opacity/__init__", "ops/temporal_opacity/twin",
+            "ops/temporal_opacity/cpu",
+        )
+    }  # fmt: skip
     text = page.read_text(encoding="utf-8")
     for path in set(re.findall(r"\b(?:gsdmsr_cli|tests|presets)/[\w/]+\.(?:py|yaml)", text)):
-        assert (ROOT / path).is_file() or path in examples | {"presets/linear.yaml"}, path
+        assert (ROOT / path).is_file() or path in made | {"presets/linear.yaml"}, path
 
 
 @pytest.mark.parametrize("command", COMMANDS)
 def test_every_subcommand_has_a_page_that_names_its_options(command: str) -> None:
     from typer.main import get_command
 
-    from gsdmsr_cli.cli import app
+    from gsdmsr_cli.cli.main import app
 
     group: Any = get_command(app)
     assert set(group.commands) == set(COMMANDS)

@@ -8,10 +8,11 @@ import torch
 from torch import Tensor
 
 from gsdmsr_cli.formats import read_scene
-from gsdmsr_cli.pictures import Pictures
-from gsdmsr_cli.preset import Preset, load_preset
+from gsdmsr_cli.model.model import Model
+from gsdmsr_cli.options.preset import Preset, load_preset
 from gsdmsr_cli.raster import Engine, best_engine
-from gsdmsr_cli.run import Run, create_run
+from gsdmsr_cli.runs.run import Run, create_run
+from gsdmsr_cli.scene.pictures import Pictures
 from gsdmsr_cli.training.trainer import Trainer
 
 STEPS = 40
@@ -53,3 +54,8 @@ def assert_same_tensors(found: dict[str, Tensor], expected: dict[str, Tensor]) -
     assert found.keys() == expected.keys()
     for name, tensor in expected.items():
         assert torch.equal(found[name], tensor), name
+
+
+def per_splat(model: Model) -> list[str]:
+    """Return the names of the tensors with rows of splats: of all, or of those that move."""
+    return [parameter.name for parameter in model.parameters() if parameter.per_splat]

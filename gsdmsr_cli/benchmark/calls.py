@@ -11,7 +11,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from types import FrameType
 
-from gsdmsr_cli.errors import GsdmsrError
+from gsdmsr_cli.ground.errors import GsdmsrError
 
 INTERRUPTED = 130
 """Exit code of a command that Ctrl-C has ended."""
@@ -109,7 +109,7 @@ def _start_logged(line: Line, log: Path, threads: int) -> subprocess.Popen[bytes
 
 def _start(line: Line, shown: int, threads: int = 0) -> subprocess.Popen[bytes]:
     """Start a command that writes all it shows to the file descriptor ``shown``."""
-    command = [sys.executable, "-m", "gsdmsr_cli.cli", *line]
+    command = [sys.executable, "-m", "gsdmsr_cli", *line]
     limit = {"NUMBA_NUM_THREADS": str(threads), "OMP_NUM_THREADS": str(threads)} if threads else {}
     # In a session of its own, or a terminal would interrupt it as well: a second Ctrl-C, at which
     # a training no longer waits to save what it has.

@@ -7,9 +7,9 @@ import math
 import numpy as np
 import torch
 
-from gsdmsr_cli.camera import Camera, look_at
-from gsdmsr_cli.geometry import SH_C0
-from gsdmsr_cli.splats import Splats
+from gsdmsr_cli.gaussians.splats import Splats
+from gsdmsr_cli.ground.geometry import SH_C0
+from gsdmsr_cli.scene.camera import Camera, look_at
 
 SHELLS = 6
 FIELD_OF_VIEW = 0.6911

@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from gsdmsr_cli.benchmark.trials import Trial
-from gsdmsr_cli.charts import Line, line_chart
-from gsdmsr_cli.run import open_run
+from gsdmsr_cli.ground.charts import Line, line_chart
+from gsdmsr_cli.runs.run import open_run
 
 
 def charts_of(trials: Sequence[Trial], root: Path) -> dict[str, str]:

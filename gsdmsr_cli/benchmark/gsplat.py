@@ -11,7 +11,7 @@ from torch import Tensor
 
 from gsdmsr_cli.benchmark import workloads
 from gsdmsr_cli.benchmark.cloud import camera, cloud
-from gsdmsr_cli.geometry import SH_C0
+from gsdmsr_cli.ground.geometry import SH_C0
 
 
 def load_gsplat() -> Any:

@@ -14,8 +14,8 @@ import torch
 from torch import Tensor
 
 from gsdmsr_cli.benchmark.calls import call
-from gsdmsr_cli.errors import DataError, GsdmsrError
-from gsdmsr_cli.run import Checkpoint, is_run, open_run
+from gsdmsr_cli.ground.errors import DataError, GsdmsrError
+from gsdmsr_cli.runs.run import Checkpoint, is_run, open_run
 
 OFTEN = "training.checkpoint_minutes=0.02"
 """A checkpoint a second, so that kills fall into the writing of one as well."""
@@ -37,7 +37,7 @@ class Kill:
 
 
 def survive(
-    options: Sequence[str], root: Path, kills: int, seed: int, tell: Callable[[Kill], None]
+    options: Sequence[str], root: Path, kills: int, seed: int, on_kill: Callable[[Kill], None]
 ) -> list[Kill]:
     """Train once undisturbed, then ``kills`` times with a SIGKILL, and compare the ends.
 
@@ -46,7 +46,7 @@ def survive(
         root: folder of the runs.
         kills: how many trainings to kill, each at a moment chosen evenly from the first's duration.
         seed: of those moments.
-        tell: called after each.
+        on_kill: called after each.
 
     Raises:
         DataError: the folder ``root`` is in use.
@@ -69,19 +69,19 @@ def survive(
             call("train", *line, "--out", str(folder), how)
         identical = same(open_run(folder).load(), expected)
         found.append(Kill(after_s, None if saved is None else saved.step, identical))
-        tell(found[-1])
+        on_kill(found[-1])
     return found
 
 
 def _train_and_kill(line: Sequence[str], after_s: float) -> None:
-    command = [sys.executable, "-m", "gsdmsr_cli.cli", "train", *line]
+    command = [sys.executable, "-m", "gsdmsr_cli", "train", *line]
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     try:
         code = process.wait(timeout=after_s)
     except subprocess.TimeoutExpired:
         code = 0
     finally:
-        process.kill()  # its helpers notice, and end
+        process.kill()  # its workers notice, and end
         process.wait()
     if code:
         raise GsdmsrError(f"gsdmsr train has failed by itself, with exit code {code}")
@@ -94,7 +94,7 @@ def _saved(folder: Path) -> Checkpoint | None:
 
 
 def same(found: Checkpoint, expected: Checkpoint) -> bool:
-    """Tell whether two checkpoints are the same in all but the wall time that they took."""
+    """Return whether two checkpoints are the same in all but the wall time that they took."""
     alike = (found.step, found.state) == (expected.step, expected.state)
     names = found.tensors.keys() == expected.tensors.keys()
     if not (alike and names):

@@ -7,7 +7,7 @@ from typing import Any
 
 from gsdmsr_cli.benchmark.trials import Trial
 from gsdmsr_cli.evaluation.protocol import average
-from gsdmsr_cli.scene import SPLITS
+from gsdmsr_cli.scene.scene import SPLITS
 
 MEAN = "mean"
 """What stands for a scene in the rows that average over scenes."""

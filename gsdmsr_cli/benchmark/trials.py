@@ -14,12 +14,12 @@ from pathlib import Path
 from typing import Any
 
 from gsdmsr_cli.benchmark.calls import Line, call, call_side_by_side
-from gsdmsr_cli.errors import DataError
-from gsdmsr_cli.files import read_json
 from gsdmsr_cli.formats import read_scene
-from gsdmsr_cli.machine import cores
-from gsdmsr_cli.preset import Preset, load_preset
-from gsdmsr_cli.run import Run, is_run, open_run
+from gsdmsr_cli.ground.errors import DataError
+from gsdmsr_cli.ground.files import read_json
+from gsdmsr_cli.ground.machine import cores
+from gsdmsr_cli.options.preset import Preset, load_preset
+from gsdmsr_cli.runs.run import Run, is_run, open_run
 
 
 @dataclass(frozen=True)
@@ -190,7 +190,7 @@ def _require_same(run: Run, trial: Trial, terms: Terms) -> None:
 
 
 def _is_report_of(path: Path, step: int, terms: Terms) -> bool:
-    """Tell whether ``path`` is a report of the checkpoint at this step on these terms."""
+    """Return whether ``path`` is a report of the checkpoint at this step on these terms."""
     if not path.is_file():
         return False
     about = read_json(path)["protocol"]

@@ -8,12 +8,13 @@ import torch
 from torch import Tensor
 
 from gsdmsr_cli.benchmark.cloud import camera, cloud
-from gsdmsr_cli.fields.planes import CUBE
-from gsdmsr_cli.model import Model
-from gsdmsr_cli.motion import Facts, start_motion
+from gsdmsr_cli.drawing.splatting import draw
+from gsdmsr_cli.gaussians.moment import Moment
+from gsdmsr_cli.model.building import start_model
+from gsdmsr_cli.model.layer import Facts
+from gsdmsr_cli.ops.planes import CUBE
 from gsdmsr_cli.raster import best_engine
-from gsdmsr_cli.splatting import draw
-from gsdmsr_cli.training.look import compare
+from gsdmsr_cli.training.gradients.compare import compare
 from gsdmsr_cli.training.optimizer import Adam
 
 TIME = 0.65
@@ -39,7 +40,7 @@ def drawing(size: int, count: int, device: str = "cpu") -> Callable[[], None]:
     slope = slope_of(size, device)
 
     def run() -> None:
-        frame = engine.rasterize(splats, view, background)
+        frame = engine.rasterize(Moment(splats), view, background)
         frame.rgb.backward(slope.permute(1, 2, 0))  # type: ignore[no-untyped-call]
         for tensor in splats.tensors().values():
             tensor.grad = None
@@ -61,18 +62,19 @@ def wait(device: str) -> None:
 
 def training_step(size: int, count: int, motion: str, device: str = "cpu") -> Callable[[], None]:
     """Return a function that makes a training step at rate 0: L1 + SSIM, one view."""
-    moving = start_motion({"name": motion}, Facts(1.0, CUBE, FRAMES), count, _generator())
-    model = Model(cloud(count), moving).to(device)
-    model.motion.advance(1.0)
+    facts = Facts(1.0, CUBE, FRAMES)
+    model = start_model(cloud(count), {"name": motion}, (), facts, _generator()).to(device)
+    model.advance(1.0)
     engine, view, background = best_engine(device), camera(size), torch.ones(3, device=device)
     target = target_of(draw(model, view, TIME, engine, background).rgb.cpu()).to(device)
     optimizer, rates = Adam(), dict.fromkeys(model.tensors(), 0.0)
 
     def run() -> None:
-        look = compare(engine, model, model.at(TIME), view, background, target, SSIM_WEIGHT)
-        for tensor, gradient in zip(model.tensors().values(), look.gradients, strict=True):
+        moment = model.at(model.instant(TIME, view))
+        found = compare(engine, model, moment, view, background, target, SSIM_WEIGHT)
+        for tensor, gradient in zip(model.trained().values(), found.gradients, strict=True):
             tensor.grad = gradient
-        optimizer.step(model.tensors(), rates)
+        optimizer.step(model.trained(), rates)
         wait(device)
 
     return run

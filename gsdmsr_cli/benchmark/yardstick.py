@@ -13,8 +13,8 @@ import numpy as np
 
 from gsdmsr_cli.benchmark.cloud import camera, cloud
 from gsdmsr_cli.benchmark.workloads import TIME
-from gsdmsr_cli.errors import DataError
-from gsdmsr_cli.geometry import SH_C0
+from gsdmsr_cli.ground.errors import DataError
+from gsdmsr_cli.ground.geometry import SH_C0
 
 
 def load_yardstick(folder: Path) -> Any:

@@ -1,1 +1,1 @@
-"""From a video, a rig or pictures to a scene folder with cameras; one module per stage."""
+"""Prepares a scene folder with cameras from a video, a camera rig or pictures."""

@@ -1,4 +1,4 @@
-"""COLMAP's stages in a process of their own, which ends at once with ours."""
+"""Runs jobs of COLMAP in a child process, which is killed if this process ends."""
 
 from __future__ import annotations
 
@@ -8,16 +8,17 @@ import subprocess
 import sys
 import tempfile
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
-from gsdmsr_cli.errors import DataError, GsdmsrError
+from gsdmsr_cli.ground.errors import DataError, GsdmsrError
+from gsdmsr_cli.ground.progress import OnProgress
 
 REFUSED = 3
-"""Exit code of a child that has told, on its last line, why the data cannot be used."""
+"""Exit code of a child whose last line says why the data cannot be used."""
 
 DISK = ("disk", "no space", "file too large", "filesystem error", "i/o error")
-"""Words by which SQLite and COLMAP tell that a file could not be written."""
+"""Words by which messages of SQLite and COLMAP say that a file could not be written."""
 
 FAILED = "COLMAP has failed in its job"
 """How the message of a job's failure begins."""
@@ -26,13 +27,13 @@ ONE_THREAD = {"OMP_NUM_THREADS": "1"}
 """OpenMP's threads come and go with the load, and what is found would change with them."""
 
 
-def run_child(job: str, arguments: Mapping[str, Any], tell: Callable[[int, int], None]) -> None:
-    """Do a job of ``capture.colmap`` and wait for it; whatever happens, it has ended afterwards.
+def run_child(job: str, arguments: Mapping[str, Any], on_progress: OnProgress) -> None:
+    """Do a job of ``capture.colmap`` and wait for it; it has ended when this returns or raises.
 
     Args:
         job: name of the job.
         arguments: what it takes, fit for JSON; ``out`` is the folder that it writes.
-        tell: called with how much is done, and of how much.
+        on_progress: called with how much is done, and of how much.
 
     Raises:
         DataError: the job says that the data cannot be used.
@@ -41,14 +42,14 @@ def run_child(job: str, arguments: Mapping[str, Any], tell: Callable[[int, int],
     # the folder is named for lists of processes; arguments may be longer than a command line
     line = [sys.executable, "-m", "gsdmsr_cli.capture.colmap", job, str(arguments["out"])]
     last = ""
-    # in a session of its own: Ctrl-C is for us, who then end it
+    # in a session of its own: Ctrl-C reaches this process alone, which then kills the child
     with (
-        tempfile.TemporaryFile("w+", errors="replace") as said,
+        tempfile.TemporaryFile("w+", errors="replace") as errors,
         subprocess.Popen(
             line,
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
-            stderr=said,
+            stderr=errors,
             text=True,
             start_new_session=True,
             env=os.environ | ONE_THREAD,
@@ -61,7 +62,7 @@ def run_child(job: str, arguments: Mapping[str, Any], tell: Callable[[int, int],
             for text in process.stdout:
                 match text.split():
                     case ["progress", done, total]:
-                        tell(int(done), int(total))
+                        on_progress(int(done), int(total))
                     case _:
                         last = text.strip()
             code = process.wait()
@@ -71,8 +72,8 @@ def run_child(job: str, arguments: Mapping[str, Any], tell: Callable[[int, int],
         if code == REFUSED:
             raise DataError(last)
         if code:
-            said.seek(0)
-            raise _failure(job, [line.strip() for line in said if line.strip()], code)
+            errors.seek(0)
+            raise _failure(job, [line.strip() for line in errors if line.strip()], code)
 
 
 def _failure(job: str, lines: list[str], code: int) -> GsdmsrError:
@@ -92,7 +93,7 @@ def _failure(job: str, lines: list[str], code: int) -> GsdmsrError:
 def receive_arguments() -> dict[str, Any]:
     """In a child: return what the job takes.
 
-    From now on the child ends as soon as the parent has, however it did, and so its end of stdin.
+    A thread then waits for the end of stdin, that is, of the parent, and ends the child with it.
     """
     arguments: dict[str, Any] = json.loads(sys.stdin.readline())
 

@@ -1,4 +1,4 @@
-"""COLMAP's part: matches features between frames and maps them; run by ``capture.child``.
+"""Matches features between frames and finds cameras with COLMAP, in a process of its own.
 
 Everything is deterministic, whatever the number of cores: frames are numbered before anything is
 written about them, and each pair's sampling starts from the seed. No process has more than one
@@ -22,12 +22,12 @@ from gsdmsr_cli.capture.child import REFUSED, receive_arguments, run_child
 from gsdmsr_cli.capture.failure import why_no_model
 from gsdmsr_cli.capture.features import read_features
 from gsdmsr_cli.capture.masks import read_mask, standing
-from gsdmsr_cli.errors import DataError, GsdmsrError
-from gsdmsr_cli.files import write_json
-from gsdmsr_cli.native import load_pycolmap
+from gsdmsr_cli.ground.errors import DataError, GsdmsrError
+from gsdmsr_cli.ground.files import write_json
+from gsdmsr_cli.scene.native import load_pycolmap
 
 PAIRS_AT_ONCE = 40
-"""Pairs that are matched between two words about the progress, and the least for a process."""
+"""Pairs that are matched between two reports of the progress, and the least for a process."""
 
 DATABASE = "database.db"
 LARGEST = "largest"
@@ -77,19 +77,19 @@ def _match_apart(out: Path, pairs: Sequence[tuple[str, str]], seed: int) -> list
     processes = max(1, min(os.cpu_count() or 1, len(pairs) // PAIRS_AT_ONCE))
     cuts = [len(pairs) * k // processes for k in range(processes + 1)]
     done = [0] * processes
-    speaking = threading.Lock()
+    printing = threading.Lock()
 
     def work(index: int) -> Path:
-        def tell(count: int, _: int) -> None:
-            with speaking:
+        def on_progress(count: int, _: int) -> None:
+            with printing:
                 done[index] = count
-                _tell(sum(done), len(pairs))
+                _print_progress(sum(done), len(pairs))
 
         part = out / f"part{index}"
         part.mkdir()
         shutil.copy(out / DATABASE, part)
         share = pairs[cuts[index] : cuts[index + 1]]
-        run_child("match_share", {"out": str(part), "pairs": share, "seed": seed}, tell)
+        run_child("match_share", {"out": str(part), "pairs": share, "seed": seed}, on_progress)
         return part
 
     with ThreadPoolExecutor(processes) as pool:
@@ -112,7 +112,7 @@ def match_share(out: str, pairs: Sequence[tuple[str, str]], seed: int) -> None:
             verification_options=verification,
             device=colmap.Device.cpu,
         )
-        _tell(begin + len(chosen), len(pairs))
+        _print_progress(begin + len(chosen), len(pairs))
 
 
 def _gather(colmap: Any, database: Path, part: Path) -> None:
@@ -185,19 +185,19 @@ def _map_incrementally(
     options.ba_global_frames_ratio = options.ba_global_points_ratio = 1.2
     registered = 2
 
-    def tell() -> None:
+    def on_progress() -> None:
         nonlocal registered
         registered += 1
-        _tell(min(registered, count), count)
+        _print_progress(min(registered, count), count)
 
     return dict(
         colmap.incremental_mapping(
-            database, pictures, models, options=options, next_image_callback=tell
+            database, pictures, models, options=options, next_image_callback=on_progress
         )
     )
 
 
-def _tell(done: int, total: int) -> None:
+def _print_progress(done: int, total: int) -> None:
     print("progress", done, total, flush=True)
 
 

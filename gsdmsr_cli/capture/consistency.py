@@ -1,4 +1,4 @@
-"""What matches say about the cameras: what of them moves, and which a mere turn explains."""
+"""Computes which matches contradict the cameras, and which a mere rotation explains."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from gsdmsr_cli.capture.colmap import DATABASE
 from gsdmsr_cli.capture.reconstruction import Reconstruction
 from gsdmsr_cli.capture.verified import shared_pixels
-from gsdmsr_cli.lens import Lens
-from gsdmsr_cli.native import load_pycolmap
+from gsdmsr_cli.scene.lens import Lens
+from gsdmsr_cli.scene.native import load_pycolmap
 
 Floats = NDArray[np.float64]
 

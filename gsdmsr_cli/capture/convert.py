@@ -1,9 +1,8 @@
-"""A published data set, in any layout that is read, as a scene folder."""
+"""Writes a published data set, in any supported layout, as a scene folder."""
 
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,18 +11,22 @@ import numpy as np
 
 from gsdmsr_cli.capture import write
 from gsdmsr_cli.capture.versions import versions
-from gsdmsr_cli.errors import DataError
-from gsdmsr_cli.imaging import read_image, write_png
-from gsdmsr_cli.scene import Scene, View
+from gsdmsr_cli.ground.errors import DataError
+from gsdmsr_cli.ground.progress import OnProgress
+from gsdmsr_cli.scene.imaging import read_image, write_png
+from gsdmsr_cli.scene.scene import MASK, MOVING, Scene, View
 
 POINTS = "points.ply"
+
+FOLDERS = {MASK: "counted", MOVING: "masks"}
+"""Where the files of each signal are written."""
 
 GREY = 0.5
 """Colour of points that have none."""
 
 
-def write_converted(folder: Path, scene: Scene, tell: Callable[[int, int], None]) -> None:
-    """Write a scene that has been read, whose world is settled, into ``folder``.
+def write_converted(folder: Path, scene: Scene, on_progress: OnProgress) -> None:
+    """Write a scene that has been read, whose world is normalised, into ``folder``.
 
     Pictures are copied as they are; those taken through a lens are undistorted.
 
@@ -33,7 +36,7 @@ def write_converted(folder: Path, scene: Scene, tell: Callable[[int, int], None]
     views = []
     for done, view in enumerate(scene.views, start=1):
         views.append(_placed(folder, view))
-        tell(done, len(scene.views))
+        on_progress(done, len(scene.views))
     write.write_transforms(folder / "transforms.json", views, POINTS)
     colours = np.full(scene.points.shape, GREY) if scene.colours is None else scene.colours
     levels = np.rint(colours * 255).clip(0, 255).astype(np.uint8)
@@ -50,9 +53,11 @@ def _placed(folder: Path, view: View) -> View:
     """Write the view's pictures below ``folder``; return it with them, as a pinhole's."""
     name = f"{view.split}_{view.name}"
     image = _written(folder, Path("images") / name, view, view.image_path)
-    mask = view.mask_path and _written(folder, Path("counted") / name, view, view.mask_path)
-    moving = view.moving_path and _written(folder, Path("masks") / name, view, view.moving_path)
-    return replace(view, image_path=image, mask_path=mask, moving_path=moving, lens=None)
+    signals = {
+        signal: _written(folder, Path(FOLDERS[signal]) / name, view, path)
+        for signal, path in view.signals.items()
+    }
+    return replace(view, image_path=image, signals=signals, lens=None)
 
 
 def _written(folder: Path, place: Path, view: View, path: Path) -> Path:

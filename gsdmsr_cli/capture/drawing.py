@@ -1,4 +1,4 @@
-"""The path of the camera and the points it saw, from above and from the side, as SVG."""
+"""Draws the camera path and the points as SVG, from above and from the side."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from gsdmsr_cli.scene import View
+from gsdmsr_cli.scene.scene import View
 
 Floats = NDArray[np.float64]
 

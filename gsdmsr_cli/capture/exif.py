@@ -1,4 +1,4 @@
-"""What a camera has noted in a picture: which way is up, when it was taken and its focal length."""
+"""Reads a picture's EXIF tags: orientation, time of exposure and focal length."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from gsdmsr_cli.native import OpenImageIO
+from gsdmsr_cli.scene.native import OpenImageIO
 
 FULL_FRAME_DIAGONAL = math.hypot(36, 24)
 """Of the film that "35 mm equivalent" focal lengths refer to [mm]."""
 
 
 @dataclass(frozen=True)
-class Notes:
-    """The notes of one picture.
+class ExifTags:
+    """EXIF tags of one picture.
 
     Attributes:
         orientation: of EXIF, 1 to 8.
@@ -31,16 +31,16 @@ class Notes:
     focal: float | None = None
 
 
-def read_notes(path: Path) -> Notes:
-    """Return the notes of a picture, empty where it has none or cannot be read."""
+def read_exif(path: Path) -> ExifTags:
+    """Return the tags of a picture, empty where it has none or cannot be read."""
     source = OpenImageIO.ImageInput.open(str(path))
     if source is None:
-        OpenImageIO.geterror()  # forget it: decoding the pixels will tell
-        return Notes()
+        OpenImageIO.geterror()  # clear it: decoding the pixels will show
+        return ExifTags()
     spec = source.spec()
     source.close()
     orientation = spec.getattribute("Orientation") or 1
-    return Notes(
+    return ExifTags(
         orientation if orientation in range(1, 9) else 1,
         _taken(spec),
         _focal(spec.getattribute("Exif:FocalLengthIn35mmFilm")),

@@ -1,4 +1,4 @@
-"""Why no cameras could be found, as far as the matches tell, and what to do."""
+"""Explains why COLMAP found no cameras, from its matches, and what the user can do."""
 
 from __future__ import annotations
 

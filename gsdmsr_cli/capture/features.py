@@ -1,4 +1,4 @@
-"""Scale-invariant features of every frame (Lowe 2004), by OpenCV, as COLMAP wants them.
+"""Finds scale-invariant features (SIFT, Lowe 2004) in every frame with OpenCV.
 
 OpenCV's SIFT is faster on a CPU than the one within COLMAP. Descriptors are
 normalised to RootSIFT (Arandjelovic & Zisserman 2012), which COLMAP's matcher expects.
@@ -7,7 +7,7 @@ normalised to RootSIFT (Arandjelovic & Zisserman 2012), which COLMAP's matcher e
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,10 +15,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from gsdmsr_cli.native import cv2
+from gsdmsr_cli.ground.progress import OnProgress
+from gsdmsr_cli.scene.native import cv2
 
 LONGEST = 960
-"""Longer side at which features are looked for [px]; finer ones cost time and add little."""
+"""Longer side at which features are searched [px]; finer ones cost time and add little."""
 
 CONTRAST = 0.01
 """Least contrast of a feature; low, so that dim walls have some as well."""
@@ -42,7 +43,7 @@ class Features:
 
 
 def write_features(
-    folder: Path, pictures: Sequence[Path], count: int, tell: Callable[[int, int], None]
+    folder: Path, pictures: Sequence[Path], count: int, on_progress: OnProgress
 ) -> None:
     """Write the ``count`` strongest features of each picture to a file of its name."""
 
@@ -57,7 +58,7 @@ def write_features(
     pool = ThreadPoolExecutor(os.cpu_count())
     try:
         for done, _ in enumerate(pool.map(work, pictures), start=1):
-            tell(done, len(pictures))
+            on_progress(done, len(pictures))
     finally:
         pool.shutdown(cancel_futures=True)
         cv2.setNumThreads(threads)

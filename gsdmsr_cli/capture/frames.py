@@ -1,10 +1,10 @@
-"""Which pictures of a capture become frames, at which times; written upright, in one size."""
+"""Chooses sharp pictures of a capture as frames, and writes them upright and in one size."""
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -13,17 +13,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gsdmsr_cli.capture.exif import Notes, read_notes, upright
+from gsdmsr_cli.capture.exif import ExifTags, read_exif, upright
 from gsdmsr_cli.capture.source import Source
-from gsdmsr_cli.errors import DataError
-from gsdmsr_cli.files import read_json, write_json
-from gsdmsr_cli.imaging import read_image, write_png
-from gsdmsr_cli.native import cv2
-from gsdmsr_cli.video import read_video, video_length
+from gsdmsr_cli.ground.errors import DataError
+from gsdmsr_cli.ground.files import read_json, write_json
+from gsdmsr_cli.ground.progress import OnProgress
+from gsdmsr_cli.scene.imaging import read_image, write_png
+from gsdmsr_cli.scene.native import cv2
+from gsdmsr_cli.scene.video import read_video, video_length
 
 Picture = NDArray[np.uint8]
-Tell = Callable[[int, int], None]
-
 LEAST = 8
 """Fewer frames do not make a scene."""
 
@@ -36,7 +35,7 @@ NEIGHBOURS = 5
 PICTURES, NOTE = "pictures", "frames.json"
 """Folder and file that ``read_frames`` reads."""
 
-_LOOKED_AT = 640  # longer side at which sharpness is measured [px]
+_SHARPNESS_SIDE = 640  # longer side at which sharpness is measured [px]
 
 
 @dataclass(frozen=True)
@@ -46,8 +45,8 @@ class Candidate:
     Attributes:
         file: name of the picture or video.
         index: number of the frame in its video.
-        time: seconds, or steps where nothing tells seconds, from the first.
-        sharpness: variance of the Laplacian, or 0 where it has not been looked at.
+        time: seconds, or steps where seconds are unknown, from the first.
+        sharpness: variance of the Laplacian, or 0 where it is not known.
     """
 
     file: str
@@ -94,14 +93,16 @@ class Frames:
         return self.taken[-1].time - self.taken[0].time if self.in_seconds else None
 
 
-def write_frames(folder: Path, source: Source, count: int, max_side: int, tell: Tell) -> None:
-    """Choose frames from the source and write them and a note of them into ``folder``.
+def write_frames(
+    folder: Path, source: Source, count: int, max_side: int, on_progress: OnProgress
+) -> None:
+    """Choose frames from the source and write them and ``frames.json`` into ``folder``.
 
     Raises:
         DataError: a file cannot be read, there are too few frames, or they differ in size.
     """
     survey = _survey_videos if source.kind == "video" else _survey_pictures
-    candidates, in_seconds, notes = survey(source, count, tell)
+    candidates, in_seconds, tags = survey(source, count, on_progress)
     chosen = choose(candidates, count)
     taken, blurred = leave_out_blurred(chosen)
     if len(taken) < LEAST:
@@ -112,7 +113,7 @@ def write_frames(folder: Path, source: Source, count: int, max_side: int, tell: 
     (folder / PICTURES).mkdir()
     names = tuple(f"{i:05d}.png" for i in range(len(taken)))
     original_sizes = []
-    for i, picture in enumerate(_pictures(source, taken, notes)):
+    for i, picture in enumerate(_pictures(source, taken, tags)):
         small = shrunk(picture, max_side)
         original_sizes.append((picture.shape[1], picture.shape[0]))
         if original_sizes[-1] != original_sizes[0]:
@@ -121,9 +122,9 @@ def write_frames(folder: Path, source: Source, count: int, max_side: int, tell: 
                 "all must have one size: they share one lens"
             )
         write_png(folder / PICTURES / names[i], small)
-        tell(len(candidates) + i + 1, len(candidates) + len(taken))
+        on_progress(len(candidates) + i + 1, len(candidates) + len(taken))
     size = small.shape[1], small.shape[0]
-    focals = {note.focal for note in notes.values()}
+    focals = {own.focal for own in tags.values()}
     focal = focals.pop() if len(focals) == 1 else None
     write_json(
         folder / NOTE,
@@ -185,15 +186,15 @@ def leave_out_blurred(chosen: Sequence[Candidate]) -> tuple[list[Candidate], lis
 
 def sharpness(picture: Picture) -> float:
     """Return the variance of the Laplacian of (H, W, C) pixels at a common size."""
-    grey = cv2.cvtColor(shrunk(picture, _LOOKED_AT), cv2.COLOR_RGB2GRAY)
+    grey = cv2.cvtColor(shrunk(picture, _SHARPNESS_SIDE), cv2.COLOR_RGB2GRAY)
     return float(cv2.Laplacian(grey, cv2.CV_32F).var())
 
 
-_Survey = tuple[list[Candidate], bool, dict[str, Notes]]
+_Survey = tuple[list[Candidate], bool, dict[str, ExifTags]]
 
 
-def _survey_videos(source: Source, count: int, tell: Tell) -> _Survey:
-    """Look at every frame of the videos, which follow one another without a gap."""
+def _survey_videos(source: Source, count: int, on_progress: OnProgress) -> _Survey:
+    """Return every frame of the videos as a candidate, which follow one another without a gap."""
     total = sum(video_length(path) for path in source.files)
     candidates: list[Candidate] = []
     start = 0.0
@@ -202,25 +203,25 @@ def _survey_videos(source: Source, count: int, tell: Tell) -> _Survey:
         for index, (time, picture) in enumerate(read_video(path)):
             step = start + time - candidates[-1].time if candidates else 0.0
             candidates.append(Candidate(path.name, index, start + time, sharpness(picture)))
-            tell(len(candidates), total + min(count, total))
+            on_progress(len(candidates), total + min(count, total))
         if len(candidates) - before > 1:
             start = candidates[-1].time + step
     return candidates, True, {}
 
 
-def _survey_pictures(source: Source, count: int, tell: Tell) -> _Survey:
-    notes = {path.name: read_notes(path) for path in source.files}
-    times, in_seconds = _picture_times(source.files, [notes[p.name].taken for p in source.files])
+def _survey_pictures(source: Source, count: int, on_progress: OnProgress) -> _Survey:
+    tags = {path.name: read_exif(path) for path in source.files}
+    times, in_seconds = _picture_times(source.files, [tags[p.name].taken for p in source.files])
     order = np.argsort(times, kind="stable")
     files = [source.files[i] for i in order]
     with ThreadPoolExecutor() as pool:
-        looked = pool.map(lambda path: sharpness(_rgb(read_image(path))), files)
+        sharpnesses = pool.map(lambda path: sharpness(_rgb(read_image(path))), files)
         candidates = []
-        for i, sharp in zip(order, looked, strict=True):
+        for i, sharp in zip(order, sharpnesses, strict=True):
             time = times[i] - min(times)
             candidates.append(Candidate(source.files[i].name, 0, time, sharp))
-            tell(len(candidates), len(files) + min(count, len(files)))
-    return candidates, in_seconds, notes
+            on_progress(len(candidates), len(files) + min(count, len(files)))
+    return candidates, in_seconds, tags
 
 
 def _picture_times(
@@ -228,7 +229,7 @@ def _picture_times(
 ) -> tuple[list[float], bool]:
     """Return each picture's time, and whether it is in seconds.
 
-    The cameras' notes where all pictures have one of their own; else the numbers that the names end
+    The EXIF times where all pictures have different ones; else the numbers that the names end
     in, where those differ; else the order of the names.
     """
     known = [time for time in taken if time is not None]
@@ -242,14 +243,14 @@ def _picture_times(
 
 
 def _pictures(
-    source: Source, taken: Sequence[Candidate], notes: dict[str, Notes]
+    source: Source, taken: Sequence[Candidate], tags: dict[str, ExifTags]
 ) -> Iterator[Picture]:
     """Yield the chosen pictures, (H, W, 3), in the order of time."""
     paths = {path.name: path for path in source.files}
     if source.kind == "images":
         for frame in taken:
             picture = _rgb(read_image(paths[frame.file]))
-            yield upright(picture, notes[frame.file].orientation)
+            yield upright(picture, tags[frame.file].orientation)
         return
     for name, path in paths.items():
         wanted = {frame.index for frame in taken if frame.file == name}

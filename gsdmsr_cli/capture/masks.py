@@ -1,23 +1,23 @@
-"""Pictures of what moves, white where it does, one for every frame: given, or found elsewhere."""
+"""Reads and writes masks of moving parts: one picture per frame, white where it moves."""
 
 from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gsdmsr_cli.capture.exif import read_notes, upright
+from gsdmsr_cli.capture.exif import read_exif, upright
 from gsdmsr_cli.capture.features import Features
 from gsdmsr_cli.capture.frames import Candidate, Frames
 from gsdmsr_cli.capture.source import PICTURES, Source
-from gsdmsr_cli.errors import DataError
-from gsdmsr_cli.files import write_json
-from gsdmsr_cli.imaging import read_image, write_png
-from gsdmsr_cli.native import cv2
+from gsdmsr_cli.ground.errors import DataError
+from gsdmsr_cli.ground.files import write_json
+from gsdmsr_cli.ground.progress import OnProgress
+from gsdmsr_cli.scene.imaging import read_image, write_png
+from gsdmsr_cli.scene.native import cv2
 
 Mask = NDArray[np.bool_]
 
@@ -55,7 +55,7 @@ def write_given_masks(
     inverted: bool,
     source: Source,
     frames: Frames,
-    tell: Callable[[int, int], None],
+    on_progress: OnProgress,
 ) -> None:
     """Write the masks of the frames, in their size, from a folder of masks that a user gives.
 
@@ -68,7 +68,7 @@ def write_given_masks(
         inverted: whether black is what moves instead.
         source: where the frames come from.
         frames: the chosen ones.
-        tell: called with how many are done, and of how many.
+        on_progress: called with how many are done, and of how many.
 
     Raises:
         DataError: a mask cannot be read or has another size, or no frame has one.
@@ -89,7 +89,7 @@ def write_given_masks(
         else:
             moving = _read(path, inverted, frames, originals[frame.file])
         write_mask(folder / name, moving)
-        tell(done, len(frames.names))
+        on_progress(done, len(frames.names))
     if len(missing) == len(frames.names):
         raise DataError(
             f"{given}: no mask has the name of a frame; that of {_wanted(frames, frames.taken[0])}"
@@ -107,7 +107,7 @@ def _read(path: Path, inverted: bool, frames: Frames, original: Path) -> Mask:
     """Return a mask in the frames' size, (H, W)."""
     picture = read_image(path)
     if frames.of_pictures:
-        picture = upright(picture, read_notes(original).orientation)
+        picture = upright(picture, read_exif(original).orientation)
     height, width, channels = picture.shape
     if (width, height) not in (frames.size, frames.original_size):
         sizes = {"{} x {}".format(*size) for size in (frames.original_size, frames.size)}
@@ -122,7 +122,7 @@ def _read(path: Path, inverted: bool, frames: Frames, original: Path) -> Mask:
 
 
 def write_mask(path: Path, moving: Mask) -> None:
-    """Write (H, W) as a picture, white where it holds."""
+    """Write an (H, W) mask as a picture, white where it is true."""
     write_png(path, np.where(moving, 255, 0).astype(np.uint8)[..., None])
 
 

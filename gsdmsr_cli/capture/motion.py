@@ -1,8 +1,7 @@
-"""Finds what moves, where the flow between frames disagrees with cameras found without masks."""
+"""Finds moving parts: pixels whose optical flow contradicts the motion of the camera."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -12,8 +11,9 @@ from gsdmsr_cli.capture.consistency import essential_matrix, rays_of, sampson_di
 from gsdmsr_cli.capture.frames import Frames
 from gsdmsr_cli.capture.masks import NOTE, Mask, write_mask
 from gsdmsr_cli.capture.reconstruction import Reconstruction
-from gsdmsr_cli.files import write_json
-from gsdmsr_cli.native import cv2
+from gsdmsr_cli.ground.files import write_json
+from gsdmsr_cli.ground.progress import OnProgress
+from gsdmsr_cli.scene.native import cv2
 
 LONGEST = 640
 """Longer side at which flow is computed [px]."""
@@ -35,7 +35,7 @@ Floats32 = NDArray[np.float32]
 
 
 def write_found_masks(
-    folder: Path, frames: Frames, found: Reconstruction, tell: Callable[[int, int], None]
+    folder: Path, frames: Frames, found: Reconstruction, on_progress: OnProgress
 ) -> None:
     """Write a mask for every frame, empty where it has no camera.
 
@@ -43,7 +43,7 @@ def write_found_masks(
         folder: to write.
         frames: the chosen ones.
         found: cameras of a first pass.
-        tell: called with how many are done, and of how many.
+        on_progress: called with how many are done, and of how many.
     """
     scale = min(1.0, LONGEST / max(frames.size))
     width, height = (round(side * scale) for side in frames.size)
@@ -59,7 +59,7 @@ def write_found_masks(
             for j in others
         ]
         masks[name] = _cleaned(np.mean(votes, axis=0) * lens.fx > OFF)
-        tell(i + 1, len(found.names))
+        on_progress(i + 1, len(found.names))
     for name in frames.names:
         small = masks.get(name, np.zeros((height, width), bool))
         large = cv2.resize(small.astype(np.uint8), frames.size, interpolation=cv2.INTER_NEAREST)

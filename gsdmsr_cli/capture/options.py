@@ -1,4 +1,4 @@
-"""What may be asked of ``prepare``."""
+"""The options of ``gsdmsr prepare``."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class Options:
         camera_model: COLMAP's name of the lens that all frames share.
         matching: which frames are compared: neighbours in time, all, or neighbours and, of a few
             evenly chosen, all; ``auto`` is exhaustive for small folders of pictures.
-        auto_mask: whether what moves is looked for, with the cameras of a first pass.
+        auto_mask: whether masks of what moves are computed, with the cameras of a first pass.
         mapping: COLMAP's global mapper or its incremental one.
         min_registered: share of the frames whose cameras must be found.
         test_every: every so many frames one is kept for testing; 0 keeps none. Of a rig it is the

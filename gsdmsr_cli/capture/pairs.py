@@ -1,4 +1,4 @@
-"""Which frames are compared with one another."""
+"""Chooses which pairs of frames COLMAP compares."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ NEIGHBOURS = 10
 FARTHEST = 128
 
 KEYFRAMES = 20
-"""Of so many frames, evenly chosen, each is compared with each if loops are looked for."""
+"""Of so many frames, evenly chosen, each is compared with each, to find loops."""
 
 FEW = 40
 """Pictures in a folder, up to this number, are all compared with one another."""

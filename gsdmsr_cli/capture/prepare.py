@@ -1,4 +1,4 @@
-"""From a source to a scene folder: the stages in their order, each kept until all are done."""
+"""Turns a capture into a scene folder; finished stages are kept until all are done."""
 
 from __future__ import annotations
 
@@ -19,22 +19,22 @@ from gsdmsr_cli.capture.features import write_features
 from gsdmsr_cli.capture.frames import Frames, read_frames, write_frames
 from gsdmsr_cli.capture.masks import digest, write_given_masks
 from gsdmsr_cli.capture.motion import write_found_masks
+from gsdmsr_cli.capture.normalize import normalize
 from gsdmsr_cli.capture.options import Options
 from gsdmsr_cli.capture.pairs import choose_pairs
 from gsdmsr_cli.capture.quality import assess
 from gsdmsr_cli.capture.reconstruction import Reconstruction, read_reconstruction
 from gsdmsr_cli.capture.report import write_page
 from gsdmsr_cli.capture.rig import Rig, read_rig, write_rig
-from gsdmsr_cli.capture.settle import settle
 from gsdmsr_cli.capture.source import Source
 from gsdmsr_cli.capture.stages import Stages
 from gsdmsr_cli.capture.versions import versions
-from gsdmsr_cli.errors import DataError
 from gsdmsr_cli.formats import read_scene
+from gsdmsr_cli.ground.errors import DataError
+from gsdmsr_cli.ground.progress import OnProgress
 
-Tell = Callable[[int, int], None]
-Watch = Callable[[str], AbstractContextManager[Tell]]
-"""Called with what begins; yields what is told of its progress."""
+ShowProgress = Callable[[str], AbstractContextManager[OnProgress]]
+"""Called with the name of a piece of work; yields the function that its progress is reported to."""
 
 POINTS, REPORT = "points.ply", "report.html"
 
@@ -51,67 +51,78 @@ class Masks:
 
 
 def prepare(
-    source: Source, masks: Masks | None, options: Options, stages: Stages, watch: Watch
+    source: Source,
+    masks: Masks | None,
+    options: Options,
+    stages: Stages,
+    show_progress: ShowProgress,
 ) -> Path:
-    """Return the folder of the finished scene, among the stages.
+    """Return the folder of the finished scene, one of the stages' folders.
 
     Raises:
         DataError: the source cannot be used; the message says why.
     """
-    work = _Work(source, options, stages, watch)
-    frames, features = work.find_frames()
+    pipeline = _Pipeline(source, options, stages, show_progress)
+    frames, features = pipeline.find_frames()
     moving, masked_by = None, "nothing"
     if masks is not None:
-        moving, masked_by = work.take_masks(masks, frames), "given"
+        moving, masked_by = pipeline.take_masks(masks, frames), "given"
     elif options.auto_mask:
-        _, first = work.find_cameras(frames, features, None)
-        moving, masked_by = work.find_masks(frames, first), "found"
-    matches, found = work.find_cameras(frames, features, moving)
+        _, first = pipeline.find_cameras(frames, features, None)
+        moving, masked_by = pipeline.find_masks(frames, first), "found"
+    matches, found = pipeline.find_cameras(frames, features, moving)
     require_registered(frames, found, options.min_registered)
     shares = moving_share(matches, found), turning_share(matches, found.lens)
     quality = assess(frames, found, *shares, masked_by, moving)
     provenance = {
-        "input": {"name": source.root.name, "kind": source.kind, "sha256": work.key["source"]},
+        "input": {"name": source.root.name, "kind": source.kind, "sha256": pipeline.key["source"]},
         "masks": masked_by,
         "options": asdict(options),
-        "versions": work.key["versions"],
+        "versions": pipeline.key["versions"],
     }
 
     def make(folder: Path) -> None:
-        with watch("writing the scene") as tell:
-            given = frames, work.rig, moving, found, options
-            _write_scene(folder, *given, provenance, quality, tell)
+        with show_progress("writing the scene") as on_progress:
+            given = frames, pipeline.rig, moving, found, options
+            _write_scene(folder, *given, provenance, quality, on_progress)
 
-    return work.run("scene", make, test_every=options.test_every)
+    return pipeline.run("scene", make, test_every=options.test_every)
 
 
-def convert(folder: Path, stages: Stages, watch: Watch) -> Path:
-    """Return the folder of a published data set's scene, among the stages.
+def convert(folder: Path, stages: Stages, show_progress: ShowProgress) -> Path:
+    """Return the folder of a published data set's scene, one of the stages' folders.
 
     Raises:
         DataError: the data set cannot be used; the message says why.
     """
-    with watch("reading the data set") as tell:
-        scene = read_scene(folder, tell)
+    with show_progress("reading the data set") as on_progress:
+        scene = read_scene(folder, on_progress)
 
     def make(made: Path) -> None:
-        with watch("writing the scene") as tell:
-            write_converted(made, scene, tell)
+        with show_progress("writing the scene") as on_progress:
+            write_converted(made, scene, on_progress)
 
     key = {"layout": scene.layout, "fingerprint": scene.fingerprint, "versions": versions()}
     return stages.run("scene", key, make)
 
 
-class _Work:
+class _Pipeline:
     """The stages, each of which depends on those before it.
 
     ``key`` holds all that the next stage depends on.
     """
 
-    def __init__(self, source: Source, options: Options, stages: Stages, watch: Watch) -> None:
-        self.source, self.options, self.stages, self.watch = source, options, stages, watch
+    def __init__(
+        self, source: Source, options: Options, stages: Stages, show_progress: ShowProgress
+    ) -> None:
+        self.source, self.options, self.stages, self.show_progress = (
+            source,
+            options,
+            stages,
+            show_progress,
+        )
         self.rig: Rig | None = None
-        with watch("reading the source"):
+        with show_progress("reading the source"):
             self.key: dict[str, Any] = {"source": source.digest(), "kind": source.kind}
         self.key["versions"] = versions()
 
@@ -125,17 +136,17 @@ class _Work:
         options = self.options
 
         def choose(folder: Path) -> None:
-            with self.watch("choosing frames") as tell:
+            with self.show_progress("choosing frames") as on_progress:
                 given = folder, self.source, options.frames, options.max_side
                 if self.source.kind == "rig":
-                    write_rig(*given, options.offsets, tell)
+                    write_rig(*given, options.offsets, on_progress)
                 else:
-                    write_frames(*given, tell)
+                    write_frames(*given, on_progress)
 
         def find(folder: Path) -> None:
-            with self.watch("finding features") as tell:
+            with self.show_progress("finding features") as on_progress:
                 pictures = [frames.folder / name for name in frames.names]
-                write_features(folder, pictures, options.features, tell)
+                write_features(folder, pictures, options.features, on_progress)
 
         chosen = self.run(
             "frames", choose, frames=options.frames, max_side=options.max_side,
@@ -150,9 +161,9 @@ class _Work:
         """Return the folder of the frames' masks, from those that a user gives."""
 
         def take(folder: Path) -> None:
-            with self.watch("reading masks") as tell:
+            with self.show_progress("reading masks") as on_progress:
                 given = masks.folder, masks.inverted
-                write_given_masks(folder, *given, self.source, frames, tell)
+                write_given_masks(folder, *given, self.source, frames, on_progress)
 
         return self.run("masks", take, masks=digest(masks.folder, masks.inverted))
 
@@ -160,19 +171,19 @@ class _Work:
         """Return the folder of masks of what disagrees with the cameras of a first pass."""
 
         def find(folder: Path) -> None:
-            with self.watch("finding what moves") as tell:
-                write_found_masks(folder, frames, first, tell)
+            with self.show_progress("finding what moves") as on_progress:
+                write_found_masks(folder, frames, first, on_progress)
 
         return self.run("masks", find, masks="found")
 
     def find_cameras(
         self, frames: Frames, features: Path, masks: Path | None
     ) -> tuple[Path, Reconstruction]:
-        """Return the folder of the matches and what was made of them."""
+        """Return the folder of the matches and the cameras found from them."""
         options = self.options
 
         def match(folder: Path) -> None:
-            with self.watch("matching frames") as tell:
+            with self.show_progress("matching frames") as on_progress:
                 video = not frames.of_pictures
                 arguments = {
                     "out": str(folder), "pictures": str(frames.folder), "names": frames.names,
@@ -181,15 +192,15 @@ class _Work:
                     "pairs": choose_pairs(len(frames.names), options.matching, video),
                     "seed": options.seed,
                 }  # fmt: skip
-                run_child("match", arguments, tell)
+                run_child("match", arguments, on_progress)
 
         def find(folder: Path) -> None:
-            with self.watch("finding cameras") as tell:
+            with self.show_progress("finding cameras") as on_progress:
                 arguments = {
                     "matches": str(matches), "pictures": str(frames.folder), "out": str(folder),
                     "mapping": options.mapping, "seed": options.seed, "count": len(frames.names),
                 }  # fmt: skip
-                run_child("map", arguments, tell)
+                run_child("map", arguments, on_progress)
 
         matches = self.run(
             "matches", match, camera_model=options.camera_model, matching=options.matching,
@@ -224,18 +235,18 @@ def _write_scene(
     options: Options,
     provenance: dict[str, Any],
     quality: dict[str, Any],
-    tell: Tell,
+    on_progress: OnProgress,
 ) -> None:
     when = dict(zip(frames.names, frames.times, strict=True))
     every = 0 if rig else options.test_every
-    views, points, bound = settle(found, [when[n] for n in found.names], every)
+    views, points, bound = normalize(found, [when[n] for n in found.names], every)
     cameras = views
     if rig is not None:
         views = rig.views(views)
     if masks is not None:
         views = write.write_masks(folder, masks, views, found.lens)
     pictures = frames.folder if rig is None else rig.folder
-    write.write_pictures(folder, pictures, views, found.lens, tell)
+    write.write_pictures(folder, pictures, views, found.lens, on_progress)
     write.write_transforms(folder / "transforms.json", views, POINTS)
     trusted = found.tracks >= (TRUSTED if rig is None else 2)
     write.write_points(folder / POINTS, points[trusted], found.colours[trusted])

@@ -1,4 +1,4 @@
-"""How good the cameras are: numbers about a reconstruction, and warnings with what to do."""
+"""Measures how good the cameras are, and warns with advice where they are doubtful."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from gsdmsr_cli.capture.frames import Frames
 from gsdmsr_cli.capture.masks import NOTE, read_mask
 from gsdmsr_cli.capture.reconstruction import Reconstruction
-from gsdmsr_cli.files import read_json
+from gsdmsr_cli.ground.files import read_json
 
 Floats = NDArray[np.float64]
 
@@ -37,7 +37,7 @@ MOVING = 0.1
 """Share of the matches that agree with no standing point beyond which something large moves."""
 
 TURNING = 0.8
-"""Share of the matches that a mere turn explains beyond which cameras may be made up."""
+"""Share of the matches that a rotation alone explains, beyond which cameras may be made up."""
 
 
 def assess(
@@ -52,7 +52,7 @@ def assess(
 
     Args:
         frames: all that were chosen.
-        found: what became of them.
+        found: the cameras that were found for them.
         moving: share of matches that disagree with the cameras.
         turning: share of matches that a camera explains that only turns.
         masked_by: where masks come from: "given", "found" or "nothing".
@@ -115,7 +115,7 @@ def _dropped(frames: Frames, found: Reconstruction) -> list[str]:
 def parallaxes(found: Reconstruction) -> Floats:
     """Return the largest angle [degrees] under which each point is seen from two cameras, (P,).
 
-    Of the first and last camera that see it and one half-way: all pairs would tell little more.
+    Of the first and last camera that see it and one half-way: all pairs would add little.
     """
     seen_by: list[list[int]] = [[] for _ in range(len(found.points))]
     for camera, points in enumerate(found.seen):

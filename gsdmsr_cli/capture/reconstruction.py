@@ -1,4 +1,4 @@
-"""What COLMAP has found, as arrays: one lens, the cameras and the points they see."""
+"""Reads what COLMAP has found as arrays: one lens, the cameras and the points they see."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsdmsr_cli.capture.colmap import LARGEST, PARTS
-from gsdmsr_cli.files import read_json
-from gsdmsr_cli.lens import Lens
-from gsdmsr_cli.native import load_pycolmap
+from gsdmsr_cli.ground.files import read_json
+from gsdmsr_cli.scene.lens import Lens
+from gsdmsr_cli.scene.native import load_pycolmap
 
 Floats = NDArray[np.float64]
 

@@ -1,4 +1,4 @@
-"""The quality report for people: a table on the screen and a page with the path of the camera."""
+"""Shows the quality of the cameras: a table on the screen and an HTML page."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsdmsr_cli.capture.drawing import draw_path
-from gsdmsr_cli.files import replacing
-from gsdmsr_cli.scene import View
+from gsdmsr_cli.ground.files import replacing
+from gsdmsr_cli.scene.scene import View
 
 SHOWN = 12
 """At most so many names of dropped frames are listed; all are in scene.json."""

@@ -1,4 +1,4 @@
-"""Several cameras that stand still and film at the same time: one time axis, one pose for each.
+"""Prepares a camera rig: fixed cameras that film together get one time axis and a pose each.
 
 Cameras are found from one picture of each, the median of a few moments: what moves is gone from it.
 """
@@ -16,17 +16,16 @@ from numpy.typing import NDArray
 from gsdmsr_cli.capture.features import find_features
 from gsdmsr_cli.capture.frames import NOTE, PICTURES, Candidate, shrunk
 from gsdmsr_cli.capture.source import Source
-from gsdmsr_cli.errors import DataError, UsageError, nearest
-from gsdmsr_cli.files import read_json, write_json
-from gsdmsr_cli.imaging import read_image, write_png
-from gsdmsr_cli.native import cv2
-from gsdmsr_cli.scene import View
-from gsdmsr_cli.video import read_video, video_length
+from gsdmsr_cli.ground.errors import DataError, UsageError, nearest
+from gsdmsr_cli.ground.files import read_json, write_json
+from gsdmsr_cli.ground.progress import OnProgress
+from gsdmsr_cli.scene.imaging import read_image, write_png
+from gsdmsr_cli.scene.native import cv2
+from gsdmsr_cli.scene.scene import View
+from gsdmsr_cli.scene.video import read_video, video_length
 
 Picture = NDArray[np.uint8]
 Floats = NDArray[np.float64]
-Tell = Callable[[int, int], None]
-
 LEAST = 3
 """Fewer cameras do not make a rig."""
 
@@ -36,7 +35,7 @@ MEDIAN_OF = 9
 STILL = 0.004
 """A camera whose picture shifts by more than this share of its longer side does not stand still."""
 
-_MATCHES = 30  # fewer between the first and last picture tell nothing
+_MATCHES = 30  # fewer between the first and last picture prove nothing
 _MOMENTS, _RIG = "moments", "rig.json"
 
 
@@ -102,7 +101,7 @@ def write_rig(
     most: int,
     max_side: int,
     offsets: Mapping[str, float],
-    tell: Tell,
+    on_progress: OnProgress,
 ) -> None:
     """Write the pictures of all cameras at up to ``most`` common moments, and what finds them.
 
@@ -112,7 +111,7 @@ def write_rig(
         most: moments, at most.
         max_side: longer side of the pictures [px].
         offsets: seconds by which a camera's clock is ahead of the others'.
-        tell: told of the frames that have been read.
+        on_progress: called with the frames read, and of how many.
 
     Raises:
         DataError: there are too few cameras, they differ in size or do not stand still, or their
@@ -126,7 +125,7 @@ def write_rig(
     if len(names) < LEAST:
         raise DataError(f"{source.root}: {len(names)} videos; a rig has at least {LEAST} cameras")
     total = 2 * sum(video_length(path) for path in source.files)
-    counted = count_calls(lambda done: tell(done, max(done, total)))
+    counted = count_calls(lambda done: on_progress(done, max(done, total)))
     clocks = [_read_clock(path, offsets.get(path.stem, 0.0), counted) for path in source.files]
     moments = common_moments(clocks, most, source.root)
     (folder / _MOMENTS).mkdir()
@@ -153,10 +152,10 @@ def write_rig(
     )  # fmt: skip
 
 
-def count_calls(tell: Callable[[int], None]) -> Callable[[], None]:
-    """Return what tells, each time that it is called, how often it has been."""
+def count_calls(on_progress: Callable[[int], None]) -> Callable[[], None]:
+    """Return a function that reports, at each call, how often it has been called."""
     numbers = count(1)
-    return lambda: tell(next(numbers))
+    return lambda: on_progress(next(numbers))
 
 
 def _read_clock(path: Path, ahead: float, counted: Callable[[], None]) -> Floats:

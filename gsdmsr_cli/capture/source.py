@@ -1,4 +1,4 @@
-"""What was given to ``prepare``: one camera's videos or pictures, or the videos of a rig."""
+"""Recognises the input of ``gsdmsr prepare``: videos, pictures, or the videos of a rig."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import hashlib
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from gsdmsr_cli.errors import DataError
+from gsdmsr_cli.ground.errors import DataError
 
 VIDEOS = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi", ".3gp", ".mts", ".m2ts", ".mpg")
 PICTURES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")

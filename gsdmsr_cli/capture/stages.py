@@ -1,4 +1,4 @@
-"""Stages of work, each a folder that appears whole, so that a second run goes on after the last."""
+"""Keeps finished stages of work in folders, so that a second run continues after them."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from gsdmsr_cli.errors import DataError
+from gsdmsr_cli.ground.errors import DataError
 
 _DIGITS = 16
 

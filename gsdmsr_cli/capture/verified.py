@@ -1,4 +1,4 @@
-"""Where two frames show the same thing, as COLMAP's database tells after verification."""
+"""Reads from COLMAP's database which pixels of two frames show the same point."""
 
 from __future__ import annotations
 

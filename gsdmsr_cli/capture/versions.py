@@ -1,4 +1,4 @@
-"""The versions of all that a scene folder depends on."""
+"""Lists the versions of the packages that a scene folder depends on."""
 
 from __future__ import annotations
 

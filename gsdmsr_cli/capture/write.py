@@ -1,8 +1,8 @@
-"""The scene folder: undistorted pictures, transforms.json, points.ply and scene.json."""
+"""Writes a scene folder: undistorted pictures, transforms.json, points.ply and scene.json."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -10,12 +10,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gsdmsr_cli.camera import Camera
 from gsdmsr_cli.capture.masks import read_mask, write_mask
-from gsdmsr_cli.files import replacing, write_json
-from gsdmsr_cli.imaging import read_image, resample, write_png
-from gsdmsr_cli.lens import Lens
-from gsdmsr_cli.scene import SPLITS, View
+from gsdmsr_cli.formats.nerfstudio import MASK_KEYS
+from gsdmsr_cli.ground.files import replacing, write_json
+from gsdmsr_cli.ground.progress import OnProgress
+from gsdmsr_cli.scene.camera import Camera
+from gsdmsr_cli.scene.imaging import read_image, resample, write_png
+from gsdmsr_cli.scene.lens import Lens
+from gsdmsr_cli.scene.scene import MOVING, SPLITS, View
 
 SCHEMA = 1
 """Of scene.json; it grows when the meaning of a key changes."""
@@ -30,7 +32,7 @@ def write_pictures(
     pictures: Path,
     views: Sequence[View],
     lens: Lens,
-    tell: Callable[[int, int], None],
+    on_progress: OnProgress,
 ) -> None:
     """Undistort the frames in ``pictures`` to the views' places below ``folder``."""
     for done, view in enumerate(views, start=1):
@@ -38,7 +40,7 @@ def write_pictures(
         target.parent.mkdir(parents=True, exist_ok=True)
         picture = read_image(pictures / view.image_path.name)
         write_png(target, picture if lens.is_pinhole else undistorted(picture, lens))
-        tell(done, len(views))
+        on_progress(done, len(views))
 
 
 def write_masks(folder: Path, masks: Path, views: Sequence[View], lens: Lens) -> tuple[View, ...]:
@@ -50,7 +52,7 @@ def write_masks(folder: Path, masks: Path, views: Sequence[View], lens: Lens) ->
         moving = read_mask(masks / view.image_path.name)[..., None].astype(np.uint8) * 255
         straight = moving if lens.is_pinhole else undistorted(moving, lens)
         write_mask(folder / target, straight.reshape(moving.shape[:2]) >= 128)
-        masked.append(replace(view, moving_path=target))
+        masked.append(replace(view, signals={**view.signals, MOVING: target}))
     return tuple(masked)
 
 
@@ -81,10 +83,7 @@ def write_transforms(path: Path, views: Sequence[View], points: str) -> None:
         }
         own = _intrinsics(view.camera)
         frame |= {key: value for key, value in own.items() if value != shared[key]}
-        if view.mask_path is not None:
-            frame["mask_path"] = view.mask_path.as_posix()
-        if view.moving_path is not None:
-            frame["motion_mask_path"] = view.moving_path.as_posix()
+        frame |= {MASK_KEYS[name]: path.as_posix() for name, path in view.signals.items()}
         frames.append(frame)
     splits = {
         f"{split}_filenames": [v.image_path.as_posix() for v in views if v.split == split]

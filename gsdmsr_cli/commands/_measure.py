@@ -1,30 +1,31 @@
-"""What eval measures of a run, as the document that it writes."""
+"""Measures a run and returns the document that ``gsdmsr eval`` writes."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from gsdmsr_cli import machine
+from gsdmsr_cli.backends.cuda import availability
 from gsdmsr_cli.commands._progress import part_of, progress_bar
 from gsdmsr_cli.commands._trained import Trained
-from gsdmsr_cli.cuda import availability
 from gsdmsr_cli.evaluation import protocol
 from gsdmsr_cli.evaluation.catalogue import PARTS, Metric, load_metrics
 from gsdmsr_cli.evaluation.metrics import Missing
 from gsdmsr_cli.evaluation.request import BOTH, Request
 from gsdmsr_cli.evaluation.speed import measure_speed
 from gsdmsr_cli.evaluation.summary import SCHEMA
-from gsdmsr_cli.files import read_json
-from gsdmsr_cli.preset import BACKGROUNDS
-from gsdmsr_cli.scene import SPLITS, View
+from gsdmsr_cli.ground import machine
+from gsdmsr_cli.ground.files import read_json
+from gsdmsr_cli.options.preset import BACKGROUNDS
+from gsdmsr_cli.scene.scene import SPLITS, View
+from gsdmsr_cli.training.timings import timings_of
 
 OTHER_VIEWS = 20
 """Views of every other split, evenly spaced, whose PSNR is reported beside that of the split."""
 
 Scored = Sequence[tuple[View, protocol.Scores]]
 
-_Sitting = tuple[str, protocol.Studio, Sequence[View], Mapping[str, Metric | Missing]]
+_Task = tuple[str, protocol.ViewRenderer, Sequence[View], Mapping[str, Metric | Missing]]
 """What is scored in one go: a split or background, and the views and metrics wanted of it."""
 
 
@@ -35,20 +36,20 @@ def measure(trained: Trained, request: Request) -> dict[str, Any]:
         DataError: the split has no views, or pictures, masks or weights cannot be read.
         UsageError: the pictures are too small for the downscale.
     """
-    views, studio = trained.scene.split(request.split), trained.studio
-    cameras = [studio.pictures.camera(view) for view in views]
+    views, renderer = trained.scene.split(request.split), trained.renderer
+    cameras = [renderer.pictures.camera(view) for view in views]
     sizes = [(camera.width, camera.height) for camera in cameras]
     metrics = load_metrics(min(sizes, key=min), request.lpips_weights, request.lpips_inria)
     _, *others = _backgrounds(trained, request)
     chosen = _views_by_split(trained, request.split)
-    work: list[_Sitting] = [
-        (split, studio, own, metrics if split == request.split else {})
+    work: list[_Task] = [
+        (split, renderer, own, metrics if split == request.split else {})
         for split, own in chosen.items()
     ]
-    work += [(name, studio.over(BACKGROUNDS[name]), views, metrics) for name in others]
+    work += [(name, renderer.over(BACKGROUNDS[name]), views, metrics) for name in others]
     scored = _score_all(work)
     shots = list(zip(cameras, (view.time for view in views), strict=True))
-    speed = measure_speed(studio.model, shots, studio.engine, studio.background)
+    speed = measure_speed(renderer.model, shots, renderer.engine, renderer.background)
     return {
         "schema": SCHEMA,
         "protocol": describe(trained, request),
@@ -67,14 +68,14 @@ def measure(trained: Trained, request: Request) -> dict[str, Any]:
     }
 
 
-def _score_all(work: Sequence[_Sitting]) -> dict[str, Scored]:
-    """Return the scores of every sitting by its name."""
+def _score_all(work: Sequence[_Task]) -> dict[str, Scored]:
+    """Return the scores of every task by its name."""
     total = sum(len(views) for _, _, views, _ in work)
     scored: dict[str, Scored] = {}
-    with progress_bar("comparing pictures") as tell:
-        for name, studio, views, metrics in work:
-            told = part_of(tell, sum(map(len, scored.values())), total)
-            scored[name] = protocol.score_views(studio, views, metrics, told)
+    with progress_bar("comparing pictures") as on_progress:
+        for name, renderer, views, metrics in work:
+            of_all = part_of(on_progress, sum(map(len, scored.values())), total)
+            scored[name] = protocol.score_views(renderer, views, metrics, of_all)
     return scored
 
 
@@ -109,7 +110,7 @@ def describe(trained: Trained, request: Request) -> dict[str, Any]:
         UsageError: the pictures are too small for the downscale.
     """
     options, checkpoint = trained.run.preset, trained.checkpoint
-    camera = trained.studio.pictures.camera(trained.scene.split(request.split)[0])
+    camera = trained.renderer.pictures.camera(trained.scene.split(request.split)[0])
     return {
         "split": request.split,
         "resolution": [camera.width, camera.height],
@@ -145,23 +146,23 @@ def _mean(scored: Scored) -> protocol.Scores:
 
 
 def _training(trained: Trained) -> dict[str, Any]:
-    """Return how the training went; one that was killed has left no account, but a log."""
+    """Return how long the training took; of one that was killed there is only the log."""
     path, checkpoint = trained.run.training_path, trained.checkpoint
-    said = read_json(path) if path.is_file() else {}
-    splats = len(trained.studio.model.splats)
+    written = read_json(path) if path.is_file() else {}
+    splats = len(trained.renderer.model.splats)
     known = {"steps": checkpoint.step, "train_s": checkpoint.elapsed, "splats": splats}
-    account = known | (said if said.get("steps") == checkpoint.step else {})
-    return account | {"stages_s": _stages(trained, account["train_s"])}
+    account = known | (written if written.get("steps") == checkpoint.step else {})
+    return account | {"stages_s": _timings(trained, account["train_s"])}
 
 
-def _stages(trained: Trained, total: float) -> dict[str, float]:
-    """Return the seconds that each stage of the training took, by the log; the rest is "other"."""
+def _timings(trained: Trained, total: float) -> dict[str, float]:
+    """Return the seconds of each timing of the training, by the log; the rest is "other"."""
     seconds: dict[str, float] = {}
     for entry in trained.run.read_log():
         if entry["step"] <= trained.checkpoint.step:
-            for stage, spent in entry.get("stages", {}).items():
-                seconds[stage] = seconds.get(stage, 0.0) + spent
+            for name, spent in timings_of(entry).items():
+                seconds[name] = seconds.get(name, 0.0) + spent
     if not seconds:
         return {}
     rest = max(total - sum(seconds.values()), 0.0)
-    return {stage: round(spent, 3) for stage, spent in (seconds | {"other": rest}).items()}
+    return {name: round(spent, 3) for name, spent in (seconds | {"other": rest}).items()}

@@ -1,4 +1,4 @@
-"""What eval and render begin with: a run, its model and its data."""
+"""Opens a trained run with its model and its data, for eval and render."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from pathlib import Path
 import torch
 
 from gsdmsr_cli import raster
-from gsdmsr_cli.errors import DataError
-from gsdmsr_cli.evaluation.protocol import Studio
+from gsdmsr_cli.evaluation.protocol import ViewRenderer
 from gsdmsr_cli.formats import read_scene
-from gsdmsr_cli.pictures import Pictures
-from gsdmsr_cli.preset import BACKGROUNDS
-from gsdmsr_cli.run import Checkpoint, Run, open_run
-from gsdmsr_cli.scene import Scene
+from gsdmsr_cli.ground.errors import DataError
+from gsdmsr_cli.options.preset import BACKGROUNDS
+from gsdmsr_cli.runs.run import Checkpoint, Run, open_run
+from gsdmsr_cli.scene.pictures import Pictures
+from gsdmsr_cli.scene.scene import Scene
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,14 +25,14 @@ class Trained:
         run: the folder.
         checkpoint: its last checkpoint.
         scene: the data that it was trained on.
-        studio: its model and all that draws it.
+        renderer: its model and all that draws it.
         device: where it is drawn, "cpu" or "cuda".
     """
 
     run: Run
     checkpoint: Checkpoint
     scene: Scene
-    studio: Studio
+    renderer: ViewRenderer
     device: str
 
 
@@ -60,8 +60,8 @@ def open_trained(
     pictures = Pictures(colour, downscale or options.downscale, options.cache_mib << 20)
     device = raster.pick_device("auto")
     behind = torch.tensor(colour).to(device)
-    studio = Studio(model.to(device), raster.best_engine(device), pictures, behind)
-    return Trained(run, checkpoint, scene, studio, device)
+    renderer = ViewRenderer(model.to(device), raster.best_engine(device), pictures, behind)
+    return Trained(run, checkpoint, scene, renderer, device)
 
 
 def _read_data(run: Run, data: Path | None) -> Scene:

@@ -1,4 +1,4 @@
-"""Shows how a training stands: a live bar on a terminal, plain lines elsewhere; on stderr."""
+"""Shows the progress of a training on stderr: a live bar, or plain lines in a log."""
 
 from __future__ import annotations
 
@@ -51,12 +51,13 @@ class TrainingDisplay:
 
 
 def describe(report: Report) -> str:
-    """Return a report as one line."""
+    """Return a report as one line; splats are dropped for values that are not finite."""
     psnr = "none" if report.psnr is None else f"{report.psnr:.2f}"
     left = _duration(report.remaining)
+    dropped = f" ({report.dropped} dropped)" if report.dropped else ""
     return (
         f"{report.progress:4.0%}  step {report.step}  {report.split} PSNR {psnr}  "
-        f"{report.splats} splats  {report.ms_per_step:.1f} ms/step  {left} left"
+        f"{report.splats} splats{dropped}  {report.ms_per_step:.1f} ms/step  {left} left"
     )
 
 

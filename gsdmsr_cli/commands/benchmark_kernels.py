@@ -1,4 +1,4 @@
-"""``gsdmsr benchmark kernels``: milliseconds of drawing and of a training step, and ratios."""
+"""``gsdmsr benchmark kernels``: times drawing and a training step, and compares them."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from rich.console import Console
 from rich.table import Table
 
 from gsdmsr_cli import raster
+from gsdmsr_cli.backends.cpu.jit import threads
+from gsdmsr_cli.backends.cuda import availability
 from gsdmsr_cli.benchmark import gsplat, workloads, yardstick
 from gsdmsr_cli.benchmark.timing import in_turns
-from gsdmsr_cli.cuda import availability
-from gsdmsr_cli.errors import UsageError
-from gsdmsr_cli.kernels.jit import threads
+from gsdmsr_cli.ground.errors import UsageError
 
 CASES = {
     "cpu": ((400, 20_000), (800, 50_000)),
@@ -24,7 +24,7 @@ CASES = {
 }
 """Sides of pictures and numbers of splats, by device."""
 
-MOTIONS = ("hexplane", "multiscale", "nodes")
+MOTIONS = ("hexplane", "multiscale", "control_points")
 
 
 def run(yardstick_folder: Path | None, device: str, as_json: bool) -> None:

@@ -1,4 +1,4 @@
-"""``gsdmsr benchmark resume``: kills trainings at random moments and compares how they end."""
+"""``gsdmsr benchmark resume``: kills trainings at random moments and compares their ends."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from rich.console import Console
 from rich.table import Table
 
 from gsdmsr_cli.benchmark.kills import Kill, survive
-from gsdmsr_cli.errors import GsdmsrError
 from gsdmsr_cli.formats import read_scene
-from gsdmsr_cli.preset import load_preset
+from gsdmsr_cli.ground.errors import GsdmsrError
+from gsdmsr_cli.options.preset import load_preset
 
 SCHEMA = 1
 
@@ -41,11 +41,13 @@ def run(
     options += [part for override in overrides for part in ("--set", override)]
     console = Console(stderr=True)
 
-    def tell(kill: Kill) -> None:
-        said = "identical" if kill.identical else "DIFFERENT"
-        console.out(f"killed after {kill.after_s:.1f} s, {_source(kill)}: {said}", highlight=False)
+    def on_progress(kill: Kill) -> None:
+        result = "identical" if kill.identical else "DIFFERENT"
+        console.out(
+            f"killed after {kill.after_s:.1f} s, {_source(kill)}: {result}", highlight=False
+        )
 
-    found = survive(options, out, kills, seed, tell)
+    found = survive(options, out, kills, seed, on_progress)
     if as_json:
         document = {"schema": SCHEMA, "kills": [asdict(kill) for kill in found]}
         sys.stdout.write(json.dumps(document) + "\n")

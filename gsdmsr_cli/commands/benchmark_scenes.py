@@ -1,4 +1,4 @@
-"""``gsdmsr benchmark scenes``: presets on scenes at equal lengths, and a table of scores."""
+"""``gsdmsr benchmark scenes``: trains presets for equal times and compares their scores."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from rich.table import Table
 from gsdmsr_cli.benchmark.curves import charts_of
 from gsdmsr_cli.benchmark.scoreboard import HEADS, TEXTS, cells, markdown, rows_of
 from gsdmsr_cli.benchmark.trials import Terms, Trial, all_trials, run_side_by_side, run_trial
-from gsdmsr_cli.errors import UsageError
-from gsdmsr_cli.files import write_json, write_text
 from gsdmsr_cli.formats import read_scene
-from gsdmsr_cli.machine import cores
+from gsdmsr_cli.ground.errors import UsageError
+from gsdmsr_cli.ground.files import write_json, write_text
+from gsdmsr_cli.ground.machine import cores
 
 SCHEMA = 1
 
@@ -48,7 +48,7 @@ def run(
     if terms.jobs > cores():
         raise UsageError(f"--jobs {terms.jobs}: this machine has {cores()} cores, give no more")
     trials = all_trials(scenes, presets, lengths, seeds)
-    for trial in trials:  # told now rather than after hours
+    for trial in trials:  # an error now rather than after hours
         trial.options(terms)
     for scene in scenes:
         read_scene(scene)

@@ -1,4 +1,4 @@
-"""``gsdmsr benchmark still``: what a run would gain and lose if what hardly moves stood still."""
+"""``gsdmsr benchmark still``: measures PSNR and speed if splats that hardly move are frozen."""
 
 from __future__ import annotations
 
@@ -15,12 +15,13 @@ from rich.table import Table
 
 from gsdmsr_cli.commands._progress import part_of, progress_bar
 from gsdmsr_cli.commands._trained import Trained, open_trained
-from gsdmsr_cli.errors import UsageError
 from gsdmsr_cli.evaluation import protocol
 from gsdmsr_cli.evaluation.speed import measure_speed
-from gsdmsr_cli.model import Model
-from gsdmsr_cli.scene import View
-from gsdmsr_cli.training.stillness import motion_saliency
+from gsdmsr_cli.ground.errors import UsageError
+from gsdmsr_cli.model.model import Model
+from gsdmsr_cli.scene.scene import View
+from gsdmsr_cli.training.population.stillness import let_stand_still, motion_saliency
+from gsdmsr_cli.training.resizing import resize_model
 
 SCHEMA = 1
 
@@ -42,17 +43,19 @@ def run(
             raise UsageError(f"--below {threshold}: must be above 0")
     trained = open_trained(run_folder, data)
     views = trained.scene.split(split)
-    saliency, mean = motion_saliency(trained.studio.model)
-    models = {0.0: trained.studio.model}
+    camera = trained.renderer.pictures.camera(views[0])
+    saliency, mean = motion_saliency(trained.renderer.model, camera)
+    models = {0.0: trained.renderer.model}
     for threshold in below:
         models[threshold], _ = trained.run.load_model()
-        models[threshold].settle(saliency < threshold, mean)
+        change = let_stand_still(models[threshold], saliency < threshold, mean)
+        resize_model(models[threshold], change)
     speeds = _speeds(trained, models, views)
     rows, total = [], len(models) * len(views)
-    with progress_bar("comparing pictures") as tell:
+    with progress_bar("comparing pictures") as on_progress:
         for number, (threshold, model) in enumerate(models.items()):
-            studio, before = replace(trained.studio, model=model), number * len(views)
-            scored = protocol.score_views(studio, views, {}, part_of(tell, before, total))
+            renderer, before = replace(trained.renderer, model=model), number * len(views)
+            scored = protocol.score_views(renderer, views, {}, part_of(on_progress, before, total))
             rows.append(
                 {
                     "below": threshold,
@@ -73,12 +76,12 @@ def _speeds(
     trained: Trained, models: Mapping[float, Model], views: Sequence[View]
 ) -> dict[float, float]:
     """Return the frames a second of each model."""
-    studio = trained.studio
-    shots = [(studio.pictures.camera(view), view.time) for view in views]
+    renderer = trained.renderer
+    shots = [(renderer.pictures.camera(view), view.time) for view in views]
     found: dict[float, list[float]] = {threshold: [] for threshold in models}
     for _ in range(ROUNDS):
         for threshold, model in models.items():
-            speed = measure_speed(model, shots, studio.engine, studio.background)
+            speed = measure_speed(model, shots, renderer.engine, renderer.background)
             found[threshold].append(speed.fps)
     return {threshold: median(rates) for threshold, rates in found.items()}
 

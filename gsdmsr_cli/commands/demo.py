@@ -1,4 +1,4 @@
-"""gsdmsr demo: makes a small moving scene, reconstructs it and says where to look."""
+"""gsdmsr demo: makes a small moving scene, reconstructs it and renders the result."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from rich.console import Console
 from gsdmsr_cli.commands import eval as evaluate
 from gsdmsr_cli.commands import render, train
 from gsdmsr_cli.commands._progress import progress_bar
-from gsdmsr_cli.errors import DataError, UsageError
+from gsdmsr_cli.demo.synthetic import write_scene
 from gsdmsr_cli.evaluation.request import Output
 from gsdmsr_cli.filming.request import Request
-from gsdmsr_cli.synthetic import write_scene
+from gsdmsr_cli.ground.errors import DataError, UsageError
 
 BUDGET = "60s"
 """Wall time of the training; with everything else the demo stays under 3 minutes on 2 cores."""
 
 MARKER = ".gsdmsr-demo"
-"""File that marks a folder as an earlier demo, which may be made anew."""
+"""File that marks a folder as an earlier demo, which may be replaced."""
 
 
 def run(out: Path) -> None:
@@ -54,16 +54,16 @@ def _claim(out: Path) -> None:
 
 
 def _write_scene(folder: Path) -> None:
-    with progress_bar("drawing the scene") as tell:
-        write_scene(folder, progress=tell)
+    with progress_bar("drawing the scene") as on_progress:
+        write_scene(folder, progress=on_progress)
 
 
 def _where_to_look(scene: Path, run_folder: Path) -> str:
-    places = [("the pictures it learnt from", scene / "train")]
+    places = [("the pictures it was trained on", scene / "train")]
     places += [("video", path) for path in sorted(run_folder.rglob("*.webm"))]
     places += [("scores", run_folder / "eval" / "metrics.json")]
     places += [("report, for a browser", run_folder / "eval" / "report.html")]
     lines = [f"  {what}: {path}" for what, path in places]
     folder = shlex.quote(str(run_folder))
     export = f"gsdmsr export {folder} --format ply --time 0.5 --out half.ply"
-    return "\n".join(["Where to look", *lines, f"  for a splat viewer: {export}"])
+    return "\n".join(["Files to open", *lines, f"  for a splat viewer: {export}"])

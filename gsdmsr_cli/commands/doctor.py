@@ -1,4 +1,4 @@
-"""gsdmsr doctor: what this machine offers, and why what is missing is missing."""
+"""gsdmsr doctor: reports what this machine offers, and why the rest is missing."""
 
 from __future__ import annotations
 
@@ -12,14 +12,16 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from gsdmsr_cli import __version__, plugins, preset_files, raster
-from gsdmsr_cli.cuda import availability
-from gsdmsr_cli.errors import GsdmsrError
+from gsdmsr_cli import __version__, raster
+from gsdmsr_cli.backends.cuda import availability
 from gsdmsr_cli.evaluation.lpips import NETS, load_lpips
 from gsdmsr_cli.evaluation.metrics import Missing
 from gsdmsr_cli.filming.encode import require_encoder
 from gsdmsr_cli.filming.request import VIDEOS
-from gsdmsr_cli.machine import cores
+from gsdmsr_cli.ground import plugins
+from gsdmsr_cli.ground.errors import GsdmsrError
+from gsdmsr_cli.ground.machine import cores
+from gsdmsr_cli.options import preset_files
 
 _PACKAGES = (
     "torch",
@@ -37,6 +39,7 @@ _PACKAGES = (
 )
 _SIMD = ("sse4.2", "avx", "avx2", "fma", "avx512f", "neon", "sve")
 _DEVICES = ("cpu", "cuda")
+_PLUGINS = ("gsdmsr_cli.model.motion", "gsdmsr_cli.formats", "gsdmsr_cli.exports")
 
 
 def run(as_json: bool) -> None:
@@ -59,9 +62,7 @@ def examine() -> dict[str, Any]:
         "packages": {name: _version(name) for name in _PACKAGES},
         "engines": {name: _engine(name) for name in raster.engine_names()},
         "lpips": {net: _lpips(net) for net in NETS},
-        "plugins": {
-            kind: plugins.names(f"gsdmsr_cli.{kind}") for kind in ("motion", "formats", "exports")
-        },
+        "plugins": {package.rpartition(".")[2]: plugins.names(package) for package in _PLUGINS},
         "presets": preset_files.preset_names(),
         "videos": {kind: _video(kind) for kind in VIDEOS},
     }

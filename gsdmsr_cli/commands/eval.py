@@ -1,4 +1,4 @@
-"""gsdmsr eval: measures a run on views that it has not seen."""
+"""gsdmsr eval: measures a run on views that it has not been trained on."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from rich.table import Table
 
 from gsdmsr_cli.commands._measure import describe, measure
 from gsdmsr_cli.commands._trained import Trained, open_trained
-from gsdmsr_cli.errors import DataError, ThresholdError, UsageError
 from gsdmsr_cli.evaluation import summary
 from gsdmsr_cli.evaluation.gates import Verdict, read_gates
 from gsdmsr_cli.evaluation.junit import junit
 from gsdmsr_cli.evaluation.markdown import markdown
 from gsdmsr_cli.evaluation.request import BOTH, Demands, Output, Request
 from gsdmsr_cli.evaluation.summary import Document
-from gsdmsr_cli.files import require_folder, write_json, write_text
+from gsdmsr_cli.ground.errors import DataError, ThresholdError, UsageError
+from gsdmsr_cli.ground.files import require_folder, write_json, write_text
+from gsdmsr_cli.reporting.frames import make_report_frames
 from gsdmsr_cli.reporting.page import page
-from gsdmsr_cli.reporting.stills import make_stills
 
 SUMMARY_VARIABLE = "GITHUB_STEP_SUMMARY"
 """Environment variable in which GitHub Actions names the file of a step's summary."""
@@ -38,7 +38,7 @@ def run(
     """Write ``RUN/eval/metrics.json`` and print it, as a table or as JSON.
 
     Raises:
-        UsageError: a demand names no metric or no number, or an output has nothing to tell.
+        UsageError: a demand names no metric or no number, or --junit is given without one.
         DataError: the run, its data, the weights or the baseline cannot be used, or a file cannot
             be written.
         ThresholdError: a demand is not met; everything is written all the same.
@@ -85,8 +85,8 @@ def _report(
     """Write the report for people, as HTML and as Markdown, and say where unless ``quietly``."""
     root = trained.run.root
     views, frames = trained.scene.split(document["protocol"]["split"]), document["frames"]
-    stills, full = make_stills(trained.studio, views, frames)
-    html = page(root.resolve().name, document, verdicts, trained.run.read_log(), stills, full)
+    shown, full = make_report_frames(trained.renderer, views, frames)
+    html = page(root.resolve().name, document, verdicts, trained.run.read_log(), shown, full)
     write_text(folder / "report.md", markdown(_heading(root), document, verdicts))
     write_text(folder / "report.html", html)
     if not quietly:

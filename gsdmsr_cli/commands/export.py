@@ -2,38 +2,54 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
-from typing import cast
 
 import torch
 from rich.console import Console
 
-from gsdmsr_cli import exports, plugins
+from gsdmsr_cli import exports
 from gsdmsr_cli.commands._progress import progress_bar
-from gsdmsr_cli.errors import UsageError
-from gsdmsr_cli.exports import Exporter, ExportOptions
-from gsdmsr_cli.run import open_run
+from gsdmsr_cli.options.preset_files import read_overrides
+from gsdmsr_cli.options.strict import Located
+from gsdmsr_cli.runs.run import open_run
 
 
-def run(run_folder: Path, format_: str, time: float | None, frames: int | None, out: Path) -> None:
-    """Write the moved splats to ``out``.
+def run(
+    run_folder: Path,
+    format_: str,
+    time: float | None,
+    frames: int | None,
+    overrides: Sequence[str],
+    out: Path,
+) -> None:
+    """Write the model of a run to ``out``.
+
+    Args:
+        run_folder: the run.
+        format_: one of ``exports.format_names()``.
+        time: the format's option of this name, or None for its default.
+        frames: likewise.
+        overrides: "name=value", further options of the format.
+        out: file or folder to write.
 
     Raises:
-        UsageError: both a moment and a number of frames, or what the format does not take.
+        UsageError: an option is not the format's or out of range, or the format cannot carry the
+            whole model.
         DataError: the run cannot be used, or ``out`` not be written.
     """
-    if time is not None and frames is not None:
-        raise UsageError("--time and --frames are both given; drop one")
-    exporter = cast(Exporter, plugins.load(exports.__name__, format_.replace("-", "_")))
-    model, _ = open_run(run_folder).load_model()
-    with progress_bar("writing splats") as tell, torch.no_grad():
-        options = ExportOptions(
-            time=time or 0.0,
-            frames=frames or 0,
-            times=() if time is None else (time,),
-            progress=tell,
-        )
-        written = exporter.export(model, out, options)
+    settings = _settings(time, frames, overrides)
+    folder = open_run(run_folder)
+    model, _ = folder.load_model()
+    with progress_bar("writing splats") as on_progress, torch.no_grad():
+        written = exports.export(format_, model, folder.facts, settings, out, on_progress)
     count, splats = len(written), len(model.splats)
     what = f"{out}" if count == 1 else f"{out}, {count} files"
     Console().out(f"wrote {what}: {splats} splats", highlight=False)
+
+
+def _settings(time: float | None, frames: int | None, overrides: Sequence[str]) -> Located:
+    """Return all options of the format that are given, each with the place where it was."""
+    named = {key: value for key, value in (("time", time), ("frames", frames)) if value is not None}
+    further = read_overrides(overrides)
+    return Located(named | further, {key: f"--{key}" for key in named} | further.places)

@@ -19,10 +19,11 @@ from gsdmsr_cli.capture.report import rows
 from gsdmsr_cli.capture.source import find_source
 from gsdmsr_cli.capture.stages import Stages
 from gsdmsr_cli.capture.write import NOTE
-from gsdmsr_cli.commands._progress import Tell, progress_bar
-from gsdmsr_cli.errors import UsageError
-from gsdmsr_cli.files import read_json, write_json
+from gsdmsr_cli.commands._progress import progress_bar
 from gsdmsr_cli.formats import recognised
+from gsdmsr_cli.ground.errors import UsageError
+from gsdmsr_cli.ground.files import read_json, write_json
+from gsdmsr_cli.ground.progress import OnProgress
 
 TIMINGS = "timings.json"
 """The one file of a scene that differs between runs on the same input."""
@@ -57,45 +58,47 @@ def run(
     """
     _refuse_used(out, overwrite)
     stages = Stages(out.with_name(f"{out.name}.stages"))
-    clock = _Clock()
+    stopwatch = _Stopwatch()
     try:
         if kind is None and recognised(given):
             _refuse_masks(given, masks, options)
-            scene = convert(given, stages, clock.watch)
+            scene = convert(given, stages, stopwatch.show_progress)
         else:
-            scene = prepare(find_source(given, kind), masks, options, stages, clock.watch)
+            scene = prepare(
+                find_source(given, kind), masks, options, stages, stopwatch.show_progress
+            )
     except KeyboardInterrupt:
         if stages.root.is_dir():
             text = f"interrupted; finished stages are kept in {shlex.quote(str(stages.root))}"
             Console(stderr=True).out(f"{text} and the same command goes on", highlight=False)
         raise
-    write_json(scene / TIMINGS, {"seconds": clock.seconds, "given": str(given.resolve())})
+    write_json(scene / TIMINGS, {"seconds": stopwatch.seconds, "given": str(given.resolve())})
     publish(scene, out)
     if not keep:
         stages.remove()
     note = read_json(out / NOTE)
     if as_json:
-        Console().out(json.dumps(note | {"seconds": clock.seconds}, indent=2), highlight=False)
+        Console().out(json.dumps(note | {"seconds": stopwatch.seconds}, indent=2), highlight=False)
         return
     if note["quality"] is not None:
         _show(note["quality"], out)
     console = Console()
-    console.out(f"wrote {out} in {sum(clock.seconds.values()):.0f} s", highlight=False)
+    console.out(f"wrote {out} in {sum(stopwatch.seconds.values()):.0f} s", highlight=False)
     command = shlex.join(["gsdmsr", "train", "--data", str(out), "--out", "runs/" + out.name])
     console.out(f"next: {command}", highlight=False)
 
 
-class _Clock:
+class _Stopwatch:
     """Shows a bar for every stage and remembers how long each took."""
 
     def __init__(self) -> None:
         self.seconds: dict[str, float] = {}
 
     @contextmanager
-    def watch(self, description: str) -> Iterator[Tell]:
+    def show_progress(self, description: str) -> Iterator[OnProgress]:
         started = time.perf_counter()
-        with progress_bar(description) as tell:
-            yield tell
+        with progress_bar(description) as on_progress:
+            yield on_progress
         self.seconds[description] = round(time.perf_counter() - started, 2)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import shlex
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -13,28 +13,37 @@ from typing import Any
 import torch
 from rich.console import Console
 
-from gsdmsr_cli import machine, raster, strict
+from gsdmsr_cli import raster
+from gsdmsr_cli.backends.cpu.jit import set_threads, threads
+from gsdmsr_cli.backends.cuda import availability
 from gsdmsr_cli.commands._progress import progress_bar
 from gsdmsr_cli.commands._training_display import TrainingDisplay
-from gsdmsr_cli.cuda import availability
-from gsdmsr_cli.errors import UsageError
-from gsdmsr_cli.files import sole_writer, write_json
 from gsdmsr_cli.formats import read_scene
-from gsdmsr_cli.kernels.jit import compile_apart, set_threads, threads
-from gsdmsr_cli.motion import motion_options
-from gsdmsr_cli.pictures import Pictures
-from gsdmsr_cli.preset import BACKGROUNDS, Preset, load_preset
-from gsdmsr_cli.run import SCHEMA, Checkpoint, Run, continue_run, create_run, open_run, refuse_used
-from gsdmsr_cli.scene import Scene
+from gsdmsr_cli.ground import machine
+from gsdmsr_cli.ground.errors import UsageError
+from gsdmsr_cli.ground.files import sole_writer, write_json
+from gsdmsr_cli.options import strict
+from gsdmsr_cli.options.preset import BACKGROUNDS, Preset, load_preset
+from gsdmsr_cli.runs.run import (
+    SCHEMA,
+    Checkpoint,
+    Run,
+    continue_run,
+    create_run,
+    open_run,
+    refuse_used,
+)
+from gsdmsr_cli.scene.pictures import Pictures
+from gsdmsr_cli.scene.scene import Scene
 from gsdmsr_cli.training.loop import train
 from gsdmsr_cli.training.schedule import new_clock
-from gsdmsr_cli.training.trainer import Trainer
+from gsdmsr_cli.training.trainer import Trainer, check_plugins
 from gsdmsr_cli.training.warm_up import warm_up, warm_up_motion
 
-MAY_CHANGE = {
-    "training": ("budget", "steps", "threads", "checkpoint_minutes"),
-    "data": ("cache_mib",),
-}
+MAY_CHANGE = (
+    "training.budget", "training.steps", "training.threads", "training.checkpoint_minutes",
+    "data.cache_mib",
+)  # fmt: skip
 """Options that a resumed training may have otherwise: its length, and what changes no result."""
 
 
@@ -55,14 +64,14 @@ def run(
         DataError: the data or the run folder cannot be used.
         KeyboardInterrupt: Ctrl-C ended the training; ``out`` holds a checkpoint to go on from.
     """
-    with ExitStack() as held:  # the run folder, from before it is read until all is written there
+    with ExitStack() as locks:  # the run folder, from before it is read until all is written there
         there = out.is_dir()
         if there:
-            held.enter_context(sole_writer(out))
+            locks.enter_context(sole_writer(out))
         earlier = open_run(out) if resume else None
         if earlier is None:
             options = load_preset(preset, config, overrides)
-            motion_options(options.motion)  # told now rather than after the data has been read
+            check_plugins(options)  # an error now rather than after the data has been read
             refuse_used(out, overwrite)
         else:
             options = _resumed_options(earlier, preset, config, overrides)
@@ -77,17 +86,17 @@ def run(
         timings = {"load_s": load_s + prepare_s}
         with trainer:
             if not there:
-                held.enter_context(sole_writer(out))  # made now: bad data leaves no empty folder
+                locks.enter_context(sole_writer(out))  # made now: bad data leaves no empty folder
             if earlier is None:
                 name = preset or (config.name if config else "default")
                 folder = create_run(out, name, options, trainer.facts, scene, overwrite)
-                folder.save(trainer.checkpoint())  # a full disk is told of now, not at the end
+                folder.save(trainer.checkpoint())  # a full disk is an error now, not at the end
             else:
                 trainer.restore(checkpoint)
                 folder = continue_run(earlier, options, scene)
                 folder.rewind_log(trainer.clock.step)
             timings["compile_s"] = _start_work(trainer, where)
-            processes = len(trainer.team)
+            processes = len(trainer.workers)
             with TrainingDisplay() as display:
                 finished = train(trainer, folder, display.show)
         _write_account(folder, trainer, where, timings, processes)
@@ -109,8 +118,8 @@ def _require_precision(options: Preset, wanted: str, device: str) -> None:
 
 
 def _read(data: Path) -> Scene:
-    with progress_bar("decoding videos") as tell:
-        return read_scene(data, tell)
+    with progress_bar("decoding videos") as on_progress:
+        return read_scene(data, on_progress)
 
 
 def _prepare(scene: Scene, options: Preset, device: str) -> Trainer:
@@ -127,25 +136,23 @@ def _prepare(scene: Scene, options: Preset, device: str) -> Trainer:
 def _start_work(trainer: Trainer, device: str) -> float:
     """Make all processes of a training ready for its first step; return how long that took [s]."""
 
-    given = trainer.scene, trainer.preset, trainer.observer.engine
+    given = trainer.scene, trainer.preset, trainer.renderer.engine
 
-    def prepare_helper() -> None:
+    def prepare_worker() -> None:
         warm_up_motion(*given)
         warm_up(*given)
 
     started = time.perf_counter()
     if device == "cpu":
-        motion = str(trainer.preset.motion["name"])
-        compile_apart(motion, [lambda: warm_up(*given), prepare_helper])
-        trainer.hire(prepare_helper)
+        trainer.start_workers(prepare_worker)
     warm_up(*given, device)
-    trainer.team.wait()
+    trainer.workers.wait()
     return time.perf_counter() - started
 
 
 def _preload(pictures: Pictures, scene: Scene) -> None:
-    with progress_bar("reading pictures") as tell:
-        pictures.preload(scene.split("train"), tell)
+    with progress_bar("reading pictures") as on_progress:
+        pictures.preload(scene.split("train"), on_progress)
 
 
 def _timed(work: Callable[[], Any]) -> tuple[Any, float]:
@@ -168,15 +175,26 @@ def _resumed_options(
         asked = load_preset(None, None, [*own, *overrides])
     else:
         asked = load_preset(preset, config, overrides)
-    for topic, value in strict.dump(asked).items():
-        for key in value.keys() | stored[topic].keys():
-            was, now = stored[topic].get(key), value.get(key)
-            if was != now and key not in MAY_CHANGE.get(topic, ()):
-                raise UsageError(
-                    f"{earlier.root}: was trained with {topic}.{key} = {json.dumps(was)}, not "
-                    f"{json.dumps(now)}; --resume may change only the length of a training"
-                )
+    earlier_values, values = _by_option(stored), _by_option(strict.dump(asked))
+    for name in earlier_values | values:
+        was, now = earlier_values.get(name), values.get(name)
+        if was != now and name not in MAY_CHANGE:
+            raise UsageError(
+                f"{earlier.root}: was trained with {name} = {json.dumps(was)}, not "
+                f"{json.dumps(now)}; --resume may change only the length of a training"
+            )
     return asked
+
+
+def _by_option(dumped: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the values of a dumped preset as "topic.key", and lists as "topic"."""
+    values: dict[str, Any] = {}
+    for topic, value in dumped.items():
+        if isinstance(value, dict):
+            values |= {f"{topic}.{key}": own for key, own in value.items()}
+        else:
+            values[topic] = value
+    return values
 
 
 def _require_rest(earlier: Run, options: Preset, checkpoint: Checkpoint) -> None:

@@ -1,4 +1,4 @@
-"""gsdmsr weights: which weights of LPIPS are here, and fetching them when told to."""
+"""gsdmsr weights: lists which weights of LPIPS are installed, and downloads missing ones."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from rich.markup import escape
 from rich.table import Table
 
 from gsdmsr_cli.commands._progress import progress_bar
-from gsdmsr_cli.errors import DataError, UsageError, nearest
 from gsdmsr_cli.evaluation.lpips import NETS, find_weights, hub_folder, load_lpips, search_folders
 from gsdmsr_cli.evaluation.metrics import Missing
 from gsdmsr_cli.evaluation.weights import Fetched, fetch, source
+from gsdmsr_cli.ground.errors import DataError, UsageError, nearest
 
 
 def run(
@@ -29,7 +29,7 @@ def run(
     Args:
         nets: networks to fetch; nothing is fetched for others.
         to: folder to fetch into, torch's own if None.
-        folder: a folder to look in before the usual places.
+        folder: a folder that is searched before the usual ones.
         as_json: print one JSON object instead of a table.
 
     Raises:
@@ -42,7 +42,7 @@ def run(
     for net in dict.fromkeys(nets):
         for kind, found in find_weights(net, folder).items():
             if isinstance(found, Missing):
-                _tell(_fetch(net, kind, to or hub_folder()), source(net, kind).url)
+                _print_fetched(_fetch(net, kind, to or hub_folder()), source(net, kind).url)
     report = examine(folder or (to if nets else None))
     if as_json:
         Console().out(json.dumps(report), highlight=False)
@@ -74,11 +74,11 @@ def _reason(net: str, folder: Path | None) -> str | None:
 
 
 def _fetch(net: str, kind: str, to: Path) -> Fetched:
-    with progress_bar(f"fetching {kind} of {net}") as tell:
-        return fetch(source(net, kind), to, tell)
+    with progress_bar(f"fetching {kind} of {net}") as on_progress:
+        return fetch(source(net, kind), to, on_progress)
 
 
-def _tell(fetched: Fetched, url: str) -> None:
+def _print_fetched(fetched: Fetched, url: str) -> None:
     text = f"fetched {url}: {fetched.size} bytes, SHA-256 {fetched.sha256}, to {fetched.path}"
     Console(stderr=True).out(text, highlight=False)
 

@@ -1,1 +1,1 @@
-"""Scores, speed and storage of a trained run."""
+"""Measures a trained run: image quality, speed and storage."""

@@ -1,4 +1,4 @@
-"""Every metric by its name, which way is better, and those that not every picture can have."""
+"""Lists all metrics: names, which direction is better, and which need large pictures."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ Metric = Callable[[Tensor, Tensor], float]
 
 
 def less_is_better(metric: str) -> bool:
-    """Tell whether the metric is a distance."""
+    """Return whether the metric is a distance."""
     return metric.startswith("lpips_")
 
 

@@ -1,4 +1,4 @@
-"""What must hold of a report: bounds on its metrics, and nothing worse than an earlier report."""
+"""Checks metrics against thresholds and against an earlier evaluation."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from gsdmsr_cli.errors import DataError, UsageError, nearest
 from gsdmsr_cli.evaluation.catalogue import METRICS, less_is_better
 from gsdmsr_cli.evaluation.request import Demands
 from gsdmsr_cli.evaluation.summary import SCHEMA, value_of
-from gsdmsr_cli.files import read_json
+from gsdmsr_cli.ground.errors import DataError, UsageError, nearest
+from gsdmsr_cli.ground.files import read_json
 
 SAME = ("split", "resolution", "background", "data_fingerprint")
 """What two reports must agree in for their figures to be comparable."""
@@ -20,12 +20,12 @@ SAME = ("split", "resolution", "background", "data_fingerprint")
 
 @dataclass(frozen=True)
 class Verdict:
-    """Whether something holds that was asked for.
+    """The result of one check.
 
     Attributes:
-        name: what was asked for, such as "psnr >= 25".
-        passed: whether it holds.
-        found: one clause that says what was found.
+        name: of the check, such as "psnr >= 25".
+        passed: its result.
+        found: the value that was found, as a clause.
     """
 
     name: str
@@ -34,7 +34,7 @@ class Verdict:
 
 
 @dataclass(frozen=True)
-class Bound:
+class Threshold:
     """A value that a metric must reach, or, where less is better, must not exceed."""
 
     metric: str
@@ -101,28 +101,28 @@ class Baseline:
 
 @dataclass(frozen=True)
 class Gates:
-    """All that is asked of a report; nothing by default."""
+    """All checks of a report; none by default."""
 
-    bounds: Sequence[Bound] = ()
+    bounds: Sequence[Threshold] = ()
     baseline: Baseline | None = None
 
     def judge(self, document: Mapping[str, Any]) -> list[Verdict]:
-        """Return a verdict on everything that is asked for."""
+        """Return a verdict for every check."""
         aggregate = document["aggregate"]
         verdicts = [bound.judge(aggregate) for bound in self.bounds]
         return verdicts + (self.baseline.judge(aggregate) if self.baseline else [])
 
 
 def read_gates(demands: Demands) -> Gates:
-    """Return what the texts of the command line ask for.
+    """Return the checks that the options of the command line ask for.
 
     Raises:
         UsageError: a text names no metric or no number, or the metric is better the other way; or
             there are tolerances without a baseline.
         DataError: the baseline is not a report.
     """
-    bounds = [_bound("--fail-under", text, less=False) for text in demands.fail_under]
-    bounds += [_bound("--fail-over", text, less=True) for text in demands.fail_over]
+    bounds = [_threshold("--fail-under", text, less=False) for text in demands.fail_under]
+    bounds += [_threshold("--fail-over", text, less=True) for text in demands.fail_over]
     path = demands.baseline
     if path is None:
         if demands.tolerance:
@@ -135,12 +135,12 @@ def read_gates(demands: Demands) -> Gates:
     return Gates(bounds, Baseline(path, _read_report(path), tolerances))
 
 
-def _bound(option: str, text: str, less: bool) -> Bound:
+def _threshold(option: str, text: str, less: bool) -> Threshold:
     metric, value = _number(option, text)
     if less_is_better(metric) != less:
         better, other = ("more", "--fail-under") if less else ("less", "--fail-over")
         raise UsageError(f"{option} {text}: {better} {metric} is better; use {other} {text}")
-    return Bound(metric, value)
+    return Threshold(metric, value)
 
 
 def _number(option: str, text: str) -> tuple[str, float]:

@@ -1,4 +1,4 @@
-"""Verdicts as JUnit XML, which systems for continuous integration show as tests."""
+"""Writes the results of checks as JUnit XML, which CI systems show as tests."""
 
 from __future__ import annotations
 

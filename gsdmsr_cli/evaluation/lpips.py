@@ -1,4 +1,4 @@
-"""LPIPS (Zhang et al. 2018) in plain torch, from weights that already lie on this machine."""
+"""Computes LPIPS (Zhang et al. 2018) in plain torch, from weights on this machine."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
-from gsdmsr_cli.errors import DataError, UsageError, nearest
 from gsdmsr_cli.evaluation.lpips_trunks import ARCHITECTURES
 from gsdmsr_cli.evaluation.metrics import Missing
+from gsdmsr_cli.ground.errors import DataError, UsageError, nearest
 
 NETS = tuple(ARCHITECTURES)
 """Names of the networks: "alex", "squeeze", "vgg"."""
@@ -29,7 +29,7 @@ class Lpips:
     """The learned perceptual distance between two pictures; 0 for identical ones."""
 
     def __init__(self, net: str, trunk: nn.Sequential, weights: list[Tensor]) -> None:
-        """Hold the trunk of ``net`` and one weight vector (C,) per tap."""
+        """Take the trunk of ``net`` and one weight vector (C,) per tap."""
         architecture = ARCHITECTURES[net]
         self.net = net
         self.smallest = architecture.smallest
@@ -99,7 +99,7 @@ class Lpips:
 def load_lpips(net: str, folder: Path | None = None, device: str = "cpu") -> Lpips | Missing:
     """Load LPIPS on ``net`` ("alex", "squeeze" or "vgg"); nothing is ever downloaded.
 
-    The two files, trunk and linear layers, are looked for separately in ``folder``, in the folder
+    The two files, trunk and linear layers, are searched separately in ``folder``, in the folder
     named by $GSDMSR_LPIPS_DIR, then in torch.hub's checkpoints. The trunk may be named
     ``<net>.backbone.pth`` or as torchvision names it, and may hold the whole network or its
     ``features`` alone; the linear layers may be named ``linear/<net>.pth``, ``<net>.pth`` or
@@ -120,7 +120,7 @@ def load_lpips(net: str, folder: Path | None = None, device: str = "cpu") -> Lpi
 
 
 def search_folders(folder: Path | None = None) -> list[Path]:
-    """Return the folders in which weights are looked for, in order.
+    """Return the folders that are searched for weights, in order.
 
     Raises:
         DataError: ``folder`` is not a folder.
@@ -138,7 +138,7 @@ def hub_folder() -> Path:
 
 
 def find_weights(net: str, folder: Path | None = None) -> dict[str, Path | Missing]:
-    """Return the files of the "trunk" and the "linear" layers, or what was looked for.
+    """Return the files of the "trunk" and the "linear" layers, or why there is none.
 
     Raises:
         UsageError: there is no such network.

@@ -1,4 +1,4 @@
-"""The convolutional trunks of LPIPS, with the state-dict keys of torchvision's ``features``."""
+"""Defines the convolutional networks of LPIPS, with torchvision's names of their weights."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A report as Markdown, for logs of CI and for reading beside the HTML."""
+"""Writes the results of an evaluation as Markdown, for logs of CI and for reading."""
 
 from __future__ import annotations
 

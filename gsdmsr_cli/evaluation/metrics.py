@@ -1,4 +1,4 @@
-"""PSNR, SSIM and MS-SSIM of one picture, as the papers' tables define them (METHODS.md 0.10)."""
+"""Computes PSNR, SSIM and MS-SSIM as the tables of papers define them (METHODS.md 0.10)."""
 
 from __future__ import annotations
 
@@ -9,6 +9,8 @@ import torch
 import torch.nn.functional as F  # noqa: N812
 from torch import Tensor
 
+from gsdmsr_cli.ground.ssim import C1, C2, REACH, WINDOW
+
 PSNR_CAP = 100.0
 """JSON has no infinity: reports write this value [dB] for the PSNR of identical pictures."""
 
@@ -16,10 +18,6 @@ MS_SSIM_SMALLEST = 176
 """Least width and height [px] at which the fifth scale of MS-SSIM is as large as its window."""
 
 _SCALE_WEIGHTS = (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)
-_WINDOW = 11
-_SIGMA = 1.5
-_C1 = 0.01**2
-_C2 = 0.03**2
 
 
 @dataclass(frozen=True)
@@ -27,8 +25,8 @@ class Missing:
     """Why a metric has no value.
 
     Attributes:
-        reason: one line; of files, which were looked for.
-        searched: the folders looked into, in order.
+        reason: one line; for files, which names were searched.
+        searched: the folders that were searched, in order.
     """
 
     reason: str
@@ -81,7 +79,7 @@ def ssim(rendered: Tensor, target: Tensor, where: Tensor | None = None) -> float
     """
     _check_shapes(rendered, target)
     x, y = rendered.permute(2, 0, 1), target.to(rendered).permute(2, 0, 1)
-    luminance, contrast = _similarity(x, y, padding=_WINDOW // 2)
+    luminance, contrast = _similarity(x, y, padding=REACH)
     return _mean((luminance * contrast).mean(dim=0), where)
 
 
@@ -111,7 +109,7 @@ def ms_ssim(rendered: Tensor, target: Tensor) -> float:
         _, contrast = _similarity(x, y, padding=0)
         means.append(float(contrast.mean(dtype=torch.float64)))
         x, y = F.avg_pool2d(x, 2), F.avg_pool2d(y, 2)
-    x, y = (F.pad(image, 4 * [_WINDOW // 2], mode="reflect") for image in (x, y))
+    x, y = (F.pad(image, 4 * [REACH], mode="reflect") for image in (x, y))
     luminance, contrast = _similarity(x, y, padding=0)
     means.append(float((luminance * contrast).mean(dtype=torch.float64)))
     if any(map(math.isnan, means)):
@@ -126,15 +124,13 @@ def _similarity(x: Tensor, y: Tensor, padding: int) -> tuple[Tensor, Tensor]:
     """Return the luminance and the contrast-structure terms of SSIM of two (C, H, W) pictures."""
     mean_x, mean_y, xx, yy, xy = _blur(torch.stack([x, y, x * x, y * y, x * y]), padding)
     var_x, var_y, covariance = xx - mean_x**2, yy - mean_y**2, xy - mean_x * mean_y
-    luminance = (2 * mean_x * mean_y + _C1) / (mean_x**2 + mean_y**2 + _C1)
-    return luminance, (2 * covariance + _C2) / (var_x + var_y + _C2)
+    luminance = (2 * mean_x * mean_y + C1) / (mean_x**2 + mean_y**2 + C1)
+    return luminance, (2 * covariance + C2) / (var_x + var_y + C2)
 
 
 def _blur(maps: Tensor, padding: int) -> Tensor:
     """Convolve maps (M, C, H, W) with the Gaussian window, one axis at a time, zeros outside."""
-    offsets = torch.arange(_WINDOW, dtype=torch.float64) - _WINDOW // 2
-    weights = torch.exp(-offsets.square() / (2 * _SIGMA**2))
-    kernel = (weights / weights.sum()).to(maps)
+    kernel = torch.from_numpy(WINDOW).to(maps)
     flat = maps.reshape(-1, 1, *maps.shape[-2:])
     flat = F.conv2d(flat, kernel.view(1, 1, 1, -1), padding=(0, padding))
     flat = F.conv2d(flat, kernel.view(1, 1, -1, 1), padding=(padding, 0))

@@ -1,4 +1,4 @@
-"""Compares a model's pictures with the true ones: per frame, on average, and how it was done."""
+"""Renders views of a trained model and scores them against the true pictures."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from gsdmsr_cli.drawing.splatting import draw
 from gsdmsr_cli.evaluation.catalogue import Metric
 from gsdmsr_cli.evaluation.metrics import PSNR_CAP, Missing, psnr, quantize, ssim
-from gsdmsr_cli.model import MOVED_BY, STORED_AS, Model
-from gsdmsr_cli.pictures import Pictures
+from gsdmsr_cli.model.model import FURTHER, MOTION, STORED_AS, Model
 from gsdmsr_cli.raster import Engine
-from gsdmsr_cli.scene import View
-from gsdmsr_cli.splatting import draw
+from gsdmsr_cli.scene.pictures import Pictures
+from gsdmsr_cli.scene.scene import MASK, MOVING, View
 
 CONVENTIONS = {
     "renders": "clamped to [0, 1] and rounded to 8 bits; psnr_float is of unrounded ones",
@@ -35,8 +35,8 @@ Scores = dict[str, float | None]
 
 
 @dataclass(frozen=True, eq=False)
-class Studio:
-    """All that turns a view into a drawn and a true picture.
+class ViewRenderer:
+    """Renders views of a model and loads their true pictures.
 
     Attributes:
         model: what is drawn.
@@ -64,8 +64,8 @@ class Studio:
         """
         return self.pictures.load(view).permute(1, 2, 0).float() / 255
 
-    def over(self, background: tuple[float, float, float]) -> Studio:
-        """Return the studio with another background, behind drawn and true pictures alike."""
+    def over(self, background: tuple[float, float, float]) -> ViewRenderer:
+        """Return the renderer with another background, behind drawn and true pictures alike."""
         pictures, colour = self.pictures.over(background), self.background.new_tensor(background)
         return replace(self, pictures=pictures, background=colour)
 
@@ -78,7 +78,8 @@ class Studio:
         Raises:
             DataError: a mask cannot be read.
         """
-        counted, moving = self.pictures.counted(view), self.pictures.moving(view)
+        counted = self.pictures.signal(view, MASK)
+        moving = self.pictures.signal(view, MOVING)
         parts = {} if counted is None else {"masked": counted}
         if moving is not None:
             within = torch.ones_like(moving) if counted is None else counted
@@ -87,21 +88,21 @@ class Studio:
 
 
 def score_views(
-    studio: Studio,
+    renderer: ViewRenderer,
     views: Iterable[View],
     metrics: Mapping[str, Metric | Missing],
-    tell: Callable[[int], None],
+    on_progress: Callable[[int], None],
 ) -> list[tuple[View, Scores]]:
-    """Return the scores of every view; ``tell`` is called with how many are done.
+    """Return the scores of every view; ``on_progress`` is called with how many are done.
 
     Raises:
         DataError: a picture cannot be read.
     """
     scored = []
     for done, view in enumerate(views, start=1):
-        drawn, true, parts = studio.draw(view), studio.true(view), studio.parts(view)
+        drawn, true, parts = renderer.draw(view), renderer.true(view), renderer.parts(view)
         scored.append((view, score(drawn, true, metrics, parts)))
-        tell(done)
+        on_progress(done)
     return scored
 
 
@@ -167,7 +168,7 @@ def storage(tensors: Mapping[str, Tensor]) -> dict[str, int]:
     """Return the bytes of a checkpoint's tensors: splats, motion, and what training adds."""
     sizes = {"splats_bytes": 0, "motion_bytes": 0, "training_state_bytes": 0}
     for name, tensor in tensors.items():
-        splats, moved = name.startswith(STORED_AS), name.startswith(MOVED_BY)
+        splats, moved = name.startswith(STORED_AS), name.startswith((f"{MOTION}.", FURTHER))
         kind = "splats" if splats else "motion" if moved else "training_state"
         sizes[f"{kind}_bytes"] += tensor.nbytes
     return sizes

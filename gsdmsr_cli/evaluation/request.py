@@ -1,4 +1,4 @@
-"""What eval is asked for, before anything heavy is imported."""
+"""The options of ``gsdmsr eval``, in a module that imports nothing heavy."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ BOTH = "both"
 
 @dataclass(frozen=True)
 class Request:
-    """The wishes of one evaluation.
+    """What one evaluation measures.
 
     Attributes:
         split: views to compare, "test" or "val".
@@ -31,7 +31,7 @@ class Request:
 
 @dataclass(frozen=True)
 class Demands:
-    """What must hold of the figures, as given on the command line.
+    """The checks of the metrics, as given on the command line.
 
     Attributes:
         fail_under: "metric=value", the least of metrics of which more is better.

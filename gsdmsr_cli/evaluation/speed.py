@@ -1,4 +1,4 @@
-"""How many pictures a second a model draws, with and without its motion."""
+"""Measures how many frames a second a model renders, with and without its motion."""
 
 from __future__ import annotations
 
@@ -10,9 +10,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gsdmsr_cli.camera import Camera
-from gsdmsr_cli.model import Model
+from gsdmsr_cli.drawing.splatting import draw, draw_moment
+from gsdmsr_cli.model.model import Model
 from gsdmsr_cli.raster import Engine
+from gsdmsr_cli.scene.camera import Camera
 
 WARM_UP = 3
 """Frames drawn before the clock starts."""
@@ -21,7 +22,7 @@ SECONDS = 1.0
 """Least time measured."""
 
 SHOTS = 16
-"""Most cameras that are drawn in turn; their moved splats are held in memory."""
+"""Most cameras that are drawn in turn; their moved splats are kept in memory."""
 
 
 @dataclass(frozen=True)
@@ -52,17 +53,20 @@ def measure_speed(
     cameras = [camera for camera, _ in chosen]
 
     def move(i: int) -> object:
-        return engine.rasterize(model.at(chosen[i][1]), cameras[i], background)
+        return draw(model, cameras[i], chosen[i][1], engine, background)
 
     def wait() -> None:
         if background.is_cuda:
             torch.cuda.synchronize()
 
     fps, frames = _rate(move, len(chosen), wait)
-    moved = [model.at(moment) for _, moment in chosen]
-    fps_raster, _ = _rate(
-        lambda i: engine.rasterize(moved[i], cameras[i], background), len(chosen), wait
-    )
+    instants = [model.instant(time, camera) for camera, time in chosen]
+    moved = [model.at(instant) for instant in instants]
+
+    def rasterize(i: int) -> object:
+        return draw_moment(model, moved[i], instants[i], cameras[i], engine, background)
+
+    fps_raster, _ = _rate(rasterize, len(chosen), wait)
     return Speed(fps, fps_raster, frames)
 
 

@@ -1,4 +1,4 @@
-"""A report's figures as short texts, for tables in a terminal, in Markdown and in HTML."""
+"""Formats the results of an evaluation as short texts for tables."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where the weights of LPIPS lie, where they come from, and fetching them when told to."""
+"""Downloads the weights of LPIPS, when the user asks for them, and checks their hashes."""
 
 from __future__ import annotations
 
@@ -6,13 +6,14 @@ import hashlib
 import http.client
 import re
 import urllib.request
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from gsdmsr_cli.errors import DataError
 from gsdmsr_cli.evaluation.lpips_trunks import ARCHITECTURES
-from gsdmsr_cli.files import replacing, require_folder
+from gsdmsr_cli.ground.errors import DataError
+from gsdmsr_cli.ground.files import replacing, require_folder
+from gsdmsr_cli.ground.progress import OnProgress
 
 TRUNKS = "https://download.pytorch.org/models/"
 """Where torchvision has its weights; their names carry the beginning of their hash."""
@@ -29,9 +30,6 @@ _LINEAR_HASHES = {
 }
 _CHUNK = 1 << 20
 _TIMEOUT = 30.0
-
-Tell = Callable[[int, int], None]
-"""Called with the bytes that are there, and of how many; 0 where the server does not say."""
 
 
 @dataclass(frozen=True)
@@ -68,7 +66,7 @@ def source(net: str, kind: str) -> Source:
     return Source(TRUNKS + name, name, found[1])
 
 
-def fetch(wanted: Source, folder: Path, tell: Tell) -> Fetched:
+def fetch(wanted: Source, folder: Path, on_progress: OnProgress) -> Fetched:
     """Download a file into a folder, which is made; it is there whole and checked, or not at all.
 
     Raises:
@@ -77,7 +75,7 @@ def fetch(wanted: Source, folder: Path, tell: Tell) -> Fetched:
     require_folder(folder)
     path, digest, size = folder / wanted.name, hashlib.sha256(), 0
     with replacing(path) as beside, beside.open("wb") as file:
-        for chunk in _download(wanted.url, tell):
+        for chunk in _download(wanted.url, on_progress):
             digest.update(chunk)
             size += len(chunk)
             file.write(chunk)
@@ -90,13 +88,13 @@ def fetch(wanted: Source, folder: Path, tell: Tell) -> Fetched:
     return Fetched(path, size, found)
 
 
-def _download(url: str, tell: Tell) -> Iterator[bytes]:
+def _download(url: str, on_progress: OnProgress) -> Iterator[bytes]:
     try:
         with urllib.request.urlopen(url, timeout=_TIMEOUT) as response:
             total, done = int(response.headers.get("Content-Length", 0)), 0
             while chunk := response.read(_CHUNK):
                 done += len(chunk)
-                tell(done, total)
+                on_progress(done, total)
                 yield chunk
     except (OSError, http.client.HTTPException) as error:
         reason = getattr(error, "reason", None) or error

@@ -1,72 +1,105 @@
-"""One file per export format.
+"""Writes a trained model as files for other programs: one module of this package per file format.
 
-A format is a module of this package with one function::
-
-    def export(model: MovingSplats, target: Path, options: ExportOptions) -> list[Path]
-        # writes the model to target and returns the files written
+An exporter is a module with ``Options``, a frozen dataclass of its settings, and the two functions
+of the protocol ``Exporter``. Exporters never import one another; what they share lies in files with
+a leading underscore.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+import dataclasses
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Any, Protocol, cast
 
-from gsdmsr_cli.errors import UsageError
+from gsdmsr_cli.ground import plugins
+from gsdmsr_cli.ground.errors import UsageError
+from gsdmsr_cli.ground.progress import OnProgress
+from gsdmsr_cli.options import strict
 
-if TYPE_CHECKING:  # Splats brings torch, which --help must not wait for
-    from gsdmsr_cli.splats import Splats
+if TYPE_CHECKING:  # Model brings torch, which --help must not wait for
+    from gsdmsr_cli.model.model import Model
 
 
-class MovingSplats(Protocol):
-    """What can be exported: splats at any time."""
+class Facts(Protocol):
+    """What an exporter may know of the scene besides the model; ``run.json`` holds it."""
 
-    def at(self, time: float) -> Splats:
-        """Return the splats at ``time`` in [0, 1]."""
+    @property
+    def bound(self) -> float:
+        """Half edge of the cube around the origin that holds the scene [world units]."""
+
+    @property
+    def frames(self) -> int:
+        """Number of distinct times of the train views."""
 
 
 class Exporter(Protocol):
-    """What a module of this package offers."""
+    """What a module of this package offers beside its ``Options``."""
 
-    def export(self, model: MovingSplats, target: Path, options: ExportOptions) -> list[Path]:
-        """Write ``model`` to ``target`` and return the files written."""
+    Options: type[Any]
+
+    def lost(self, model: Model, options: Any) -> list[str]:
+        """Return what the file cannot carry of the model with these options, a phrase for each.
+
+        What the user leaves out by an option is not lost.
+        """
+
+    def write(
+        self, model: Model, facts: Facts, options: Any, out: Path, on_progress: OnProgress
+    ) -> list[Path]:
+        """Write the model to the file or folder ``out`` and return the files written.
+
+        Raises:
+            UsageError: ``out`` has not the form that the format needs.
+            DataError: a splat holds NaN or infinity, or a file cannot be written.
+        """
 
 
-@dataclass(frozen=True)
-class ExportOptions:
-    """When to look at the splats.
+def format_names() -> list[str]:
+    """Return the names of all formats as users type them, sorted."""
+    return [name.replace("_", "-") for name in plugins.names(__name__)]
 
-    Attributes:
-        time: the moment that a still format shows, in [0, 1].
-        frames: number of moments that a format with motion shows, evenly over [0, 1], both ends
-            included; 0 for ``times``.
-        times: the moments, each in [0, 1].
-        progress: called with (files written, files in all) after each file.
+
+def export(
+    format_: str,
+    model: Model,
+    facts: Facts,
+    settings: strict.Located,
+    out: Path,
+    on_progress: OnProgress = lambda done, total: None,
+) -> list[Path]:
+    """Write the model in a format and return the files written.
+
+    Args:
+        format_: one of ``format_names()``.
+        model: what is written.
+        facts: of its scene.
+        settings: the format's options, and where each was given.
+        out: file or folder to write.
+        on_progress: called after every file.
 
     Raises:
-        UsageError: a time outside [0, 1], or fewer than 0 frames.
+        UsageError: there is no such format, an option is unknown or out of range, or the format
+            cannot carry the whole model.
+        DataError: a splat holds NaN or infinity, or a file cannot be written.
     """
+    exporter = cast(Exporter, plugins.load(__name__, format_.replace("-", "_")))
+    options = _read_options(format_, exporter.Options, settings)
+    if lost := exporter.lost(model, options):
+        raise UsageError(
+            f"--format {format_} cannot carry {' nor '.join(lost)} of this run; choose another "
+            f"format of {', '.join(format_names())}"
+        )
+    return exporter.write(model, facts, options, out, on_progress)
 
-    time: float = 0.0
-    frames: int = 0
-    times: tuple[float, ...] = ()
-    progress: Callable[[int, int], None] | None = None
 
-    def __post_init__(self) -> None:
-        for time in (self.time, *self.times):
-            if not 0.0 <= time <= 1.0:
-                raise UsageError(f"time {time} is outside [0, 1], from the first frame to the last")
-        if self.frames < 0:
-            raise UsageError(f"{self.frames} frames cannot be exported; --frames takes 1 or more")
-
-    def moments(self) -> tuple[float, ...]:
-        """Return the moments that ``frames`` or else ``times`` ask for; one frame shows time 0."""
-        if self.frames:
-            return tuple(i / max(self.frames - 1, 1) for i in range(self.frames))
-        return self.times
-
-    def tell(self, done: int, total: int) -> None:
-        """Report progress, if anyone listens."""
-        if self.progress is not None:
-            self.progress(done, total)
+def _read_options(format_: str, cls: type[Any], settings: strict.Located) -> Any:
+    """Return the settings as a format's ``Options``; raise UsageError unless it takes them."""
+    taken = [field.name for field in dataclasses.fields(cls)]
+    for key in settings:
+        if key not in taken:
+            place = settings.places.get(key, key)
+            raise UsageError(
+                f"{place} is not for --format {format_}, which takes "
+                f"{', '.join(taken) or 'no options'}; drop it"
+            )
+    return strict.build(cls, settings, f"--format {format_}")

@@ -1,4 +1,4 @@
-"""The PLY layout of 3DGS (Kerbl et al. 2023), read and written."""
+"""Reads and writes splats as PLY files in the layout of 3DGS (Kerbl et al. 2023)."""
 
 from __future__ import annotations
 
@@ -8,10 +8,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from gsdmsr_cli.errors import DataError
-from gsdmsr_cli.files import replacing
-from gsdmsr_cli.splats import Splats
-from gsdmsr_cli.vertices import read_vertices
+from gsdmsr_cli.gaussians.splats import Splats
+from gsdmsr_cli.ground.errors import DataError
+from gsdmsr_cli.ground.files import replacing
+from gsdmsr_cli.model.model import Model
+from gsdmsr_cli.scene.vertices import read_vertices
 
 Array = NDArray[np.float32]
 
@@ -22,6 +23,26 @@ _OPACITY = ("opacity",)
 _SCALES = ("scale_0", "scale_1", "scale_2")
 _QUATS = ("rot_0", "rot_1", "rot_2", "rot_3")
 _REST_COUNTS = (0, 9, 24, 45)  # spherical harmonics of degree 0 to 3, without the constant
+
+_NOT_CARRIED = {
+    "axes": "axes that stand in place of rotations and scales",
+    "features": "features beside the colours",
+}
+"""What a moment of a model may have besides its splats, by the attribute that holds it."""
+
+
+def splats_at(model: Model, time: float) -> Splats:
+    """Return what a PLY carries of the model at ``time`` in [0, 1]: its splats."""
+    return model.at(model.instant(time)).splats
+
+
+def lost_at(model: Model, time: float) -> list[str]:
+    """Return what a PLY does not carry of the model at ``time`` in [0, 1], a phrase for each."""
+    if model.needs_camera:
+        return ["splats that depend on the camera"]
+    moment = model.at(model.instant(time))
+    lost = [text for name, text in _NOT_CARRIED.items() if getattr(moment, name) is not None]
+    return [*lost, "colours that are made after drawing"] if model.shades else lost
 
 
 def write_ply(path: Path, splats: Splats) -> None:

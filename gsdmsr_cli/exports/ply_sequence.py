@@ -1,37 +1,76 @@
-"""Exports the moving splats as a folder of 3DGS PLY files, one per moment."""
+"""Writes the moving splats as a folder of 3DGS PLY files, one per moment."""
 
 from __future__ import annotations
 
 import re
+from dataclasses import dataclass
 from pathlib import Path
 
-from gsdmsr_cli.errors import DataError, UsageError
-from gsdmsr_cli.exports import ExportOptions, MovingSplats
-from gsdmsr_cli.exports._ply import write_ply
+from gsdmsr_cli.exports import Facts
+from gsdmsr_cli.exports._ply import lost_at, splats_at, write_ply
+from gsdmsr_cli.ground.errors import DataError, UsageError
+from gsdmsr_cli.ground.progress import OnProgress
+from gsdmsr_cli.model.model import Model
+from gsdmsr_cli.options.strict import require
 
 PREFIX = "frame"
 
 
-def export(model: MovingSplats, target: Path, options: ExportOptions) -> list[Path]:
-    """Write frame0001.ply, frame0002.ply, ... into the folder ``target``, in the order of time.
+@dataclass(frozen=True)
+class Options:
+    """Settings: either of them.
+
+    Attributes:
+        frames: number of moments, evenly over [0, 1], both ends included; a single one is 0.
+        time: the only moment, in [0, 1].
+    """
+
+    frames: int | None = None
+    time: float | None = None
+
+    def __post_init__(self) -> None:
+        require(self, "frames", self.frames is None or self.frames >= 1, "1 or more")
+        in_range = self.time is None or 0 <= self.time <= 1
+        require(self, "time", in_range, "0 to 1, from the first frame to the last")
+        if self.time is not None and self.frames is not None:
+            raise UsageError("--time and --frames are both given; drop one")
+        if self.time is None and self.frames is None:
+            raise UsageError(
+                "--format ply-sequence needs --frames N, the number of moments to write"
+            )
+
+    def moments(self) -> list[float]:
+        """Return the moments in order, each in [0, 1]."""
+        if self.time is not None:
+            return [self.time]
+        count = self.frames or 0  # 1 or more, as there is no time
+        return [i / max(count - 1, 1) for i in range(count)]
+
+
+def lost(model: Model, options: Options) -> list[str]:
+    """Return what the files cannot carry."""
+    return lost_at(model, options.moments()[0])
+
+
+def write(
+    model: Model, facts: Facts, options: Options, out: Path, on_progress: OnProgress
+) -> list[Path]:
+    """Write frame0001.ply, frame0002.ply, ... into the folder ``out``, in the order of time.
 
     The moments are those of ``options.moments()``. Viewers such as SuperSplat play every file of
     the prefix, so frames left from a longer sequence are refused rather than mixed in.
 
     Raises:
-        UsageError: ``options`` name no moment.
-        DataError: ``target`` is a file or holds other frames, a splat holds NaN or infinity, or a
+        DataError: ``out`` is a file or holds other frames, a splat holds NaN or infinity, or a
             file cannot be written.
     """
     moments = options.moments()
-    if not moments:
-        raise UsageError("--format ply-sequence needs --frames N, the number of moments to write")
     digits = max(4, len(str(len(moments))))
-    paths = [target / f"{PREFIX}{i:0{digits}d}.ply" for i in range(1, len(moments) + 1)]
-    _refuse_leftovers(target, paths)
+    paths = [out / f"{PREFIX}{i:0{digits}d}.ply" for i in range(1, len(moments) + 1)]
+    _refuse_leftovers(out, paths)
     for done, (path, time) in enumerate(zip(paths, moments, strict=True), start=1):
-        write_ply(path, model.at(time))
-        options.tell(done, len(paths))
+        write_ply(path, splats_at(model, time))
+        on_progress(done, len(paths))
     return paths
 
 

@@ -1,1 +1,1 @@
-"""What turns a film into pictures: layers, outputs, files that are gone on with, videos."""
+"""Renders a trained model along a camera path, and writes the pictures, numbers and videos."""

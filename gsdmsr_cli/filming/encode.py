@@ -1,4 +1,4 @@
-"""Videos for looking at: VP8 in WebM and H.264 in MP4, by the encoders that PyAV brings."""
+"""Encodes frames as videos: VP8 in WebM and H.264 in MP4, by the encoders that PyAV brings."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gsdmsr_cli.errors import GsdmsrError, UsageError
-from gsdmsr_cli.files import replacing
-from gsdmsr_cli.native import load_av
+from gsdmsr_cli.ground.errors import GsdmsrError, UsageError
+from gsdmsr_cli.ground.files import replacing
+from gsdmsr_cli.scene.native import load_av
 
 Pixels = NDArray[np.uint8]
 

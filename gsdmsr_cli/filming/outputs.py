@@ -1,4 +1,4 @@
-"""Layers to a picture for the eye and, where that is not enough, to numbers."""
+"""Turns what is rendered of a frame into the picture of an output, such as depth in colours."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gsdmsr_cli.evaluation.protocol import Studio
-from gsdmsr_cli.film import Shot
-from gsdmsr_cli.filming.layers import Artist, Floats, Layers
-from gsdmsr_cli.imaging import colour_wheel, eight_bits, turbo
+from gsdmsr_cli.evaluation.protocol import ViewRenderer
+from gsdmsr_cli.filming.buffers import BufferRenderer, Buffers, Floats
+from gsdmsr_cli.scene.film import Shot
+from gsdmsr_cli.scene.imaging import colour_wheel, eight_bits, turbo
 
 Pixels = NDArray[np.uint8]
 
@@ -23,12 +23,12 @@ FULL_ERROR = 0.25
 """Mean absolute difference of the colours at which the error's colours end."""
 
 SAMPLES, SAMPLE_SIDE = 8, 128
-"""How many frames, and how large [px], are looked at for the ends of the colours."""
+"""How many frames, and how large [px], are drawn to find the range of the colours."""
 
 
 @dataclass(frozen=True)
-class Ends:
-    """What the colours of a whole film end at, so that it does not flicker.
+class ColourRange:
+    """Range of the colour maps, one for all frames of a film, which would flicker otherwise.
 
     Attributes:
         near, far: depths [world units].
@@ -45,27 +45,27 @@ class Ends:
         return {key: value for key, value in asdict(self).items() if key in concern}
 
 
-def picture(output: str, layers: Layers, ends: Ends, true: Floats | None) -> Pixels:
+def picture(output: str, buffers: Buffers, colours: ColourRange, true: Floats | None) -> Pixels:
     """Return the (H, W, 1 | 3) picture of an output.
 
     Args:
         output: its name.
-        layers: what has been drawn.
-        ends: of the colours.
+        buffers: what has been rendered.
+        colours: range of the colour map.
         true: (H, W, 3) the true picture in [0, 1]; only the error needs it.
     """
     if output == "rgb":
-        return eight_bits(layers.rgb)
+        return eight_bits(buffers.rgb)
     if output == "alpha":
-        return eight_bits(layers.alpha[..., None])
+        return eight_bits(buffers.alpha[..., None])
     if output == "depth":
-        return _depth(layers, ends)
+        return _depth(buffers, colours)
     if output == "flow":
-        assert layers.flow is not None
-        fastest = np.float32(ends.fast * max(layers.alpha.shape))
-        return colour_wheel(layers.flow / fastest * layers.alpha[..., None])
+        assert buffers.flow is not None
+        fastest = np.float32(colours.fast * max(buffers.alpha.shape))
+        return colour_wheel(buffers.flow / fastest * buffers.alpha[..., None])
     assert output == "error" and true is not None
-    return error_colours(eight_bits(layers.rgb), true, FULL_ERROR)
+    return error_colours(eight_bits(buffers.rgb), true, FULL_ERROR)
 
 
 def error_colours(drawn: Pixels, true: Floats, full: float) -> Pixels:
@@ -79,35 +79,37 @@ def error_colours(drawn: Pixels, true: Floats, full: float) -> Pixels:
     return turbo(np.abs(drawn.astype(np.float32) / 255 - true).mean(2) / np.float32(full))
 
 
-def numbers(output: str, layers: Layers) -> Floats:
+def numbers(output: str, buffers: Buffers) -> Floats:
     """Return the (H, W, C) numbers of an output in ``CHANNELS``."""
     if output == "depth":
-        return layers.expected_depth[..., None]
-    assert output == "flow" and layers.flow is not None
-    return layers.flow
+        return buffers.expected_depth[..., None]
+    assert output == "flow" and buffers.flow is not None
+    return buffers.flow
 
 
-def find_ends(studio: Studio, shots: Sequence[Shot], outputs: Sequence[str]) -> Ends:
-    """Draw some frames of a film small, and return where the colours of all of them are to end.
+def find_colour_range(
+    renderer: ViewRenderer, shots: Sequence[Shot], outputs: Sequence[str]
+) -> ColourRange:
+    """Return the range of the colours for a whole film, from some of its frames, drawn small.
 
     Depths end where 1 % of what is seen lies nearer or farther, the flow where 1 % is faster.
     """
     wanted = set(CHANNELS) & set(outputs)
     chosen = range(0, len(shots), -(-len(shots) // SAMPLES))
     if not wanted:
-        return Ends()
-    artist, depths, speeds = Artist(studio, 1, wanted), [], []
+        return ColourRange()
+    buffer_renderer, depths, speeds = BufferRenderer(renderer, 1, wanted), [], []
     for i in chosen:
         following = _small(shots[i + 1]) if i + 1 < len(shots) else None
-        layers = artist.draw(_small(shots[i]), following)
-        solid = layers.alpha > 0.5
-        if layers.depth is not None:
-            depths.append(layers.expected_depth[solid])
-        if layers.flow is not None:
-            speeds.append(np.linalg.norm(layers.flow[solid], axis=1) / max(layers.alpha.shape))
+        buffers = buffer_renderer.draw(_small(shots[i]), following)
+        solid = buffers.alpha > 0.5
+        if buffers.depth is not None:
+            depths.append(buffers.expected_depth[solid])
+        if buffers.flow is not None:
+            speeds.append(np.linalg.norm(buffers.flow[solid], axis=1) / max(buffers.alpha.shape))
     near, far = _percentiles(depths, (1, 99), (0.0, 1.0))
     (fast,) = _percentiles(speeds, (99,), (1.0,))
-    return Ends(near, max(far, near + 1e-3), max(fast, 1e-6))
+    return ColourRange(near, max(far, near + 1e-3), max(fast, 1e-6))
 
 
 def _small(shot: Shot) -> Shot:
@@ -126,9 +128,9 @@ def _percentiles(
     return tuple(float(value) for value in np.percentile(values, percents))
 
 
-def _depth(layers: Layers, ends: Ends) -> Pixels:
+def _depth(buffers: Buffers, colours: ColourRange) -> Pixels:
     """Near is warm, far is cold, what is not seen is black."""
-    depth = np.minimum(layers.expected_depth, np.float32(ends.far))  # which may be infinite
-    nearness = (np.float32(ends.far) - depth) / np.float32(ends.far - ends.near)
-    shade = layers.alpha.clip(0, 1)[..., None]
+    depth = np.minimum(buffers.expected_depth, np.float32(colours.far))  # which may be infinite
+    nearness = (np.float32(colours.far) - depth) / np.float32(colours.far - colours.near)
+    shade = buffers.alpha.clip(0, 1)[..., None]
     return np.asarray(np.rint(turbo(nearness) * shade), dtype=np.uint8)

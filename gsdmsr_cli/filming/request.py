@@ -1,4 +1,4 @@
-"""What is asked of render, checked as far as it can be without the run."""
+"""The options of ``gsdmsr render``, checked as far as that is possible without the run."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import re
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from gsdmsr_cli.errors import UsageError, nearest
+from gsdmsr_cli.ground.errors import UsageError, nearest
 
 OUTPUTS = ("rgb", "depth", "alpha", "flow", "error")
 VIDEOS = ("webm", "mp4")
@@ -17,7 +17,7 @@ MOST_PIXELS = 16384
 
 @dataclass(frozen=True)
 class Request:
-    """What is asked of render.
+    """The options of ``gsdmsr render``.
 
     Attributes:
         path: see ``paths.make_film``; None for the test views and the orbit.
@@ -30,7 +30,7 @@ class Request:
         overwrite: draw frames anew that are there already.
 
     Raises:
-        UsageError: two wishes exclude each other, or one is out of range.
+        UsageError: two options exclude each other, or one is out of range.
     """
 
     path: str | None = None

@@ -1,13 +1,13 @@
-"""In which size a film is drawn, and whether what is asked for can be made of it."""
+"""Gives the cameras of a film the size that is asked for, and checks that it can be drawn."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 
-from gsdmsr_cli.errors import UsageError
-from gsdmsr_cli.film import Film, Shot
 from gsdmsr_cli.filming.request import MOST_PIXELS, Request
-from gsdmsr_cli.scene import View
+from gsdmsr_cli.ground.errors import UsageError
+from gsdmsr_cli.scene.film import Film, Shot
+from gsdmsr_cli.scene.scene import View
 
 
 def sized(film: Film, downscale: int, request: Request) -> Film:

@@ -1,30 +1,27 @@
-"""One file per input format."""
+"""Reads data sets: one module per layout of files."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from itertools import islice
 from pathlib import Path
 
-from gsdmsr_cli import plugins
-from gsdmsr_cli.errors import DataError
-from gsdmsr_cli.scene import Scene
-
-Tell = Callable[[int, int], None]
-"""Called with how much is done, and of how much."""
+from gsdmsr_cli.ground import plugins
+from gsdmsr_cli.ground.errors import DataError
+from gsdmsr_cli.ground.progress import OnProgress
+from gsdmsr_cli.scene.scene import Scene
 
 
-def read_scene(folder: Path, tell: Tell = lambda done, total: None) -> Scene:
+def read_scene(folder: Path, on_progress: OnProgress = lambda done, total: None) -> Scene:
     """Read a data folder with the first format that recognises it.
 
-    A format is a module of this package with ``SIGN: str``, the files that tell it, for messages;
-    ``matches(folder: Path) -> bool``; and ``read(folder: Path) -> Scene``, which raises DataError.
-    It may have ``prepare(folder: Path, tell: Tell)``, which does what is to be done but once, such
-    as decoding videos.
+    A format is a module of this package with ``SIGN: str``, the files that it is recognised by, for
+    messages; ``matches(folder: Path) -> bool``; and ``read(folder: Path) -> Scene``, which raises
+    DataError. It may have ``prepare(folder: Path, on_progress: OnProgress)``, which does what is
+    needed only once, such as decoding videos.
 
     Args:
         folder: of the capture.
-        tell: told of the preparations, where there are any.
+        on_progress: called with the progress of ``prepare``, where a format has one.
 
     Raises:
         DataError: there is no such folder, no format recognises it, or its content is unusable.
@@ -33,23 +30,23 @@ def read_scene(folder: Path, tell: Tell = lambda done, total: None) -> Scene:
         problem = "is a file, not a folder" if folder.exists() else "does not exist"
         raise DataError(f"data folder {folder} {problem}; give the folder of a capture")
     try:
-        return _read(folder, tell)
+        return _read(folder, on_progress)
     except OSError as error:
         raise DataError(f"data folder {folder} cannot be read: {error}") from error
 
 
 def recognised(folder: Path) -> bool:
-    """Tell whether the folder has a layout that ``read_scene`` knows."""
+    """Return whether the folder has a layout that ``read_scene`` knows."""
     names = plugins.names(__name__)
     return folder.is_dir() and any(plugins.load(__name__, n).matches(folder) for n in names)
 
 
-def _read(folder: Path, tell: Tell) -> Scene:
+def _read(folder: Path, on_progress: OnProgress) -> Scene:
     formats = [(name, plugins.load(__name__, name)) for name in plugins.names(__name__)]
     for _, module in formats:
         if module.matches(folder):
             if hasattr(module, "prepare"):
-                module.prepare(folder, tell)
+                module.prepare(folder, on_progress)
             scene: Scene = module.read(folder)
             return scene
     known = "; ".join(f"{name} ({module.SIGN})" for name, module in formats)

@@ -1,4 +1,4 @@
-"""What every reader checks before it trusts a file: numbers, poses, paths and JSON."""
+"""Checks what a data set's files hold: numbers, poses, paths and JSON."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gsdmsr_cli.errors import DataError
-from gsdmsr_cli.scene import View
+from gsdmsr_cli.ground.errors import DataError
+from gsdmsr_cli.scene.scene import View
 
 EXTENSIONS = (".png", ".jpg", ".jpeg")
 """Tried in turn after a picture's path that names no file as it stands."""
@@ -182,7 +182,7 @@ def _relative(root: Path, text: object, where: str) -> str:
 
 
 def same_shape(said: tuple[int, int], found: tuple[int, int], image: Path) -> None:
-    """Raise DataError unless a picture is of the (width, height) that is said, or resampled.
+    """Raise DataError unless a picture has the stated (width, height), or is resampled from it.
 
     Pictures may have been shrunk after their cameras were written, but not cropped.
     """

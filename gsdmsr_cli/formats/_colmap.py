@@ -1,4 +1,4 @@
-"""COLMAP's models on disk, binary and text: cameras, images and points.
+"""Reads COLMAP's models, binary and text: cameras, images and points.
 
 Facts: COLMAP's documentation of its output format and of its camera models (Schoenberger and Frahm
 2016), version 4.2.
@@ -16,8 +16,8 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from gsdmsr_cli.errors import DataError
-from gsdmsr_cli.lens import Lens
+from gsdmsr_cli.ground.errors import DataError
+from gsdmsr_cli.scene.lens import Lens
 
 Floats = NDArray[np.float64]
 T = TypeVar("T")
@@ -67,7 +67,7 @@ class ColmapModel:
 
 
 def is_model(folder: Path) -> bool:
-    """Tell whether ``folder`` holds the files of a model."""
+    """Return whether ``folder`` holds the files of a model."""
     return any((folder / f"cameras{suffix}").is_file() for suffix in (".bin", ".txt"))
 
 

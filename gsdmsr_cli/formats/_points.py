@@ -1,4 +1,4 @@
-"""Points to start from, as readers give them: positions and colours in [0, 1] if they have them."""
+"""Reads initial points: positions, and colours in [0, 1] where there are any."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from gsdmsr_cli.errors import DataError
-from gsdmsr_cli.vertices import read_vertices
+from gsdmsr_cli.ground.errors import DataError
+from gsdmsr_cli.scene.vertices import read_vertices
 
 Points = tuple[NDArray[np.float64], NDArray[np.float32] | None]
 """(P, 3) positions and (P, 3) colours, or None for the latter."""

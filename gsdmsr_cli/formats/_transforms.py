@@ -1,4 +1,4 @@
-"""What the ``transforms*.json`` of D-NeRF, instant-ngp and nerfstudio have in common."""
+"""Reads the parts that ``transforms*.json`` of D-NeRF, instant-ngp and nerfstudio share."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gsdmsr_cli.errors import DataError
 from gsdmsr_cli.formats import _checks as checks
-from gsdmsr_cli.imaging import image_size
-from gsdmsr_cli.lens import Lens
-from gsdmsr_cli.scene import View
+from gsdmsr_cli.ground.errors import DataError
+from gsdmsr_cli.scene.imaging import image_size
+from gsdmsr_cli.scene.lens import Lens
+from gsdmsr_cli.scene.scene import View
 
 CAMERA_KEYS = (
     "camera_model", "camera_angle_x", "camera_angle_y", "fl_x", "fl_y", "cx", "cy", "w", "h",

@@ -1,7 +1,7 @@
-"""Brings a real capture, of any size and anywhere, to where what follows expects a scene.
+"""Normalises a real capture: centres its world and brings it to a common size.
 
-The world's origin comes to lie amid what is looked at, and the cameras at about the distance from
-it that D-NeRF's have; axes stay what they are.
+The origin is moved to the middle of what the cameras see, and the scale is chosen such that they
+are about as far from it as D-NeRF's cameras. The axes stay.
 """
 
 from __future__ import annotations
@@ -12,12 +12,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from gsdmsr_cli.scene import View
+from gsdmsr_cli.scene.scene import View
 
 Floats = NDArray[np.float64]
 
 DISTANCE = 4.0
-"""Median depth of what is looked at [world units]; that of D-NeRF's scenes."""
+"""Median depth of what the cameras see [world units]; that of D-NeRF's scenes."""
 
 NEAREST = 0.4
 """Least depth of all but ``STRAYS`` of the points; engines draw nothing nearer than 0.2."""
@@ -26,18 +26,18 @@ STRAYS = 0.02
 """Share of the points that may be wrong, or of no interest."""
 
 VIEWS, POINTS = 60, 50_000
-"""At most so many views and points are looked at, evenly chosen."""
+"""At most so many views and points are used for it, evenly chosen."""
 
 _LEAST_POINTS = 20
 
 
 @dataclass(frozen=True, eq=False)
 class World:
-    """Where a settled world lies in the capture's own: settled = (own - centre) * scale.
+    """The normalisation of a capture's world: normalised = (own - centre) * scale.
 
     Attributes:
         centre: (3,) what becomes the origin.
-        scale: settled units per own unit.
+        scale: normalised units per own unit.
         bound: see ``Scene.bound``.
     """
 
@@ -46,11 +46,11 @@ class World:
     bound: float
 
     def points(self, points: Floats) -> NDArray[np.float32]:
-        """Return (P, 3) points, settled."""
+        """Return (P, 3) points, normalised."""
         return ((points - self.centre) * self.scale).astype(np.float32)
 
     def views(self, views: Sequence[View]) -> tuple[View, ...]:
-        """Return the views with their cameras settled."""
+        """Return the views with their cameras normalised."""
         return tuple(self._view(view) for view in views)
 
     def _view(self, view: View) -> View:
@@ -61,19 +61,19 @@ class World:
 
 
 def as_it_is(bound: float) -> World:
-    """Return a world that is settled already."""
+    """Return a world that is normalised already."""
     return World(np.zeros(3), 1.0, bound)
 
 
-def settle(
+def normalize(
     views: Sequence[View], points: Floats, depths: tuple[float, float] | None = None
 ) -> World:
-    """Return the settled world of a capture.
+    """Return the normalised world of a capture.
 
     Args:
         views: of all splits, in the capture's own world.
         points: (P, 3) on what there is to see; may be empty.
-        depths: nearest and farthest depth, where the format tells.
+        depths: nearest and farthest depth, where the format gives them.
     """
     chosen = views[:: -(-len(views) // VIEWS)]
     seen = _seen_points(chosen, points[:: -(-len(points) // POINTS or 1)])

@@ -1,4 +1,4 @@
-"""A COLMAP model with its pictures: ``sparse/0`` beside ``images``."""
+"""Reads a COLMAP model with its pictures: ``sparse/0`` beside ``images``."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ import re
 from dataclasses import replace
 from pathlib import Path
 
-from gsdmsr_cli.errors import DataError
 from gsdmsr_cli.formats import _checks as checks
 from gsdmsr_cli.formats import _colmap, _world
-from gsdmsr_cli.imaging import image_size
-from gsdmsr_cli.scene import Scene, View
+from gsdmsr_cli.ground.errors import DataError
+from gsdmsr_cli.scene.imaging import image_size
+from gsdmsr_cli.scene.scene import Scene, View
 
 SIGN = "sparse/0/cameras.bin or .txt"
 
@@ -31,7 +31,7 @@ _OTHERS = (
 
 
 def matches(folder: Path) -> bool:
-    """Tell whether ``folder`` holds a COLMAP model, and nothing that says more."""
+    """Return whether ``folder`` holds a COLMAP model, and nothing that says more."""
     return _model_folder(folder) is not None and not any(any(folder.glob(n)) for n in _OTHERS)
 
 
@@ -57,7 +57,7 @@ def read(folder: Path) -> Scene:
     checks.one_size(views)
     names = checks.unique_names(view.name for view in views)
     views = [replace(view, name=name) for view, name in zip(views, names, strict=True)]
-    world = _world.settle(views, model.points)
+    world = _world.normalize(views, model.points)
     return Scene(
         root=folder,
         layout="colmap",

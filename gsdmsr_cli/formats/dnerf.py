@@ -1,4 +1,4 @@
-"""The D-NeRF layout: ``transforms_{train,val,test}.json``, Blender's axes, a time per frame."""
+"""Reads D-NeRF's layout: ``transforms_{train,val,test}.json``, a time for each frame."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from gsdmsr_cli.errors import DataError
 from gsdmsr_cli.formats import _checks as checks
 from gsdmsr_cli.formats import _transforms as transforms
-from gsdmsr_cli.scene import SPLITS, Scene, View
+from gsdmsr_cli.ground.errors import DataError
+from gsdmsr_cli.scene.scene import SPLITS, Scene, View
 
 SIGN = "transforms_train.json"
 
@@ -21,7 +21,7 @@ BOUND = 1.3
 
 
 def matches(folder: Path) -> bool:
-    """Tell whether ``folder`` holds the JSON file of any split."""
+    """Return whether ``folder`` holds the JSON file of any split."""
     return any(path.is_file() for path in _paths(folder).values())
 
 

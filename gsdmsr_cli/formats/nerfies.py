@@ -1,4 +1,4 @@
-"""Nerfies' layout and HyperNeRF's: ``dataset.json``, ``metadata.json``, ``camera/`` and ``rgb/``.
+"""Reads Nerfies and HyperNeRF: ``dataset.json``, ``metadata.json``, ``camera/``, ``rgb/``.
 
 Facts: google/nerfies and google/hypernerf (Park et al. 2021), whose cameras are OpenCV's with
 Brown's distortion; splits and times as TiNeuVox and Deformable-3DGS read them.
@@ -12,12 +12,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gsdmsr_cli.errors import DataError
 from gsdmsr_cli.formats import _checks as checks
 from gsdmsr_cli.formats import _points, _world
-from gsdmsr_cli.imaging import image_size
-from gsdmsr_cli.lens import Lens
-from gsdmsr_cli.scene import Scene, View
+from gsdmsr_cli.ground.errors import DataError
+from gsdmsr_cli.scene.imaging import image_size
+from gsdmsr_cli.scene.lens import Lens
+from gsdmsr_cli.scene.scene import Scene, View
 
 SIGN = "dataset.json and camera/"
 
@@ -29,15 +29,15 @@ TRAIN_EVERY, TEST_AFTER = 4, 2
 
 
 def matches(folder: Path) -> bool:
-    """Tell whether ``folder`` holds the list of frames and a folder of cameras."""
+    """Return whether ``folder`` holds the list of frames and a folder of cameras."""
     return (folder / "dataset.json").is_file() and (folder / "camera").is_dir()
 
 
 def read(folder: Path) -> Scene:
     """Read a capture of Nerfies or HyperNeRF.
 
-    ``val_ids`` are the test split: nothing is chosen by them. The world is settled; what
-    ``scene.json`` says of it is used for the depths only.
+    ``val_ids`` are the test split: nothing is chosen by them. The world is normalised;
+    of ``scene.json`` only the depths are used.
 
     Raises:
         DataError: something in it cannot be used; the message names the file and frame.
@@ -50,7 +50,7 @@ def read(folder: Path) -> Scene:
     ]
     checks.one_size(views)
     points, colours = _read_points(folder / "points.npy")
-    world = _world.settle(views, points, _depths(folder / "scene.json"))
+    world = _world.normalize(views, points, _depths(folder / "scene.json"))
     files = [folder / name for name in ("dataset.json", "metadata.json", "scene.json")]
     cameras = [_camera_path(folder, name) for name in splits]
     return Scene(
@@ -184,7 +184,7 @@ def _read_points(path: Path) -> _points.Points:
 
 
 def _depths(path: Path) -> tuple[float, float] | None:
-    """Return the nearest and farthest depth in the capture's own units, if it tells them."""
+    """Return the nearest and farthest depth in the capture's own units, if it gives them."""
     if not path.is_file():
         return None
     document = checks.read_json(path)

@@ -1,4 +1,4 @@
-"""nerfstudio's layout, and the scene folder of ``gsdmsr prepare``: one ``transforms.json``.
+"""Reads nerfstudio's layout and the scene folders of ``gsdmsr prepare``: ``transforms.json``.
 
 Facts: nerfstudio's documentation of its data conventions. Beside them, a frame may have a ``time``
 and a ``motion_mask_path``, white where something moves.
@@ -10,24 +10,27 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from gsdmsr_cli.errors import DataError
 from gsdmsr_cli.formats import _checks as checks
 from gsdmsr_cli.formats import _points, _world
 from gsdmsr_cli.formats import _transforms as transforms
-from gsdmsr_cli.imaging import image_size
-from gsdmsr_cli.scene import SPLITS, Scene, View
+from gsdmsr_cli.ground.errors import DataError
+from gsdmsr_cli.scene.imaging import image_size
+from gsdmsr_cli.scene.scene import MASK, MOVING, SPLITS, Scene, View
 
 SIGN = "transforms.json"
 
-SETTLED_BY = "scene.json"
-"""Written by ``gsdmsr prepare``: the world is settled already, and this tells its bound."""
+DECLARED_BY = "scene.json"
+"""Written by ``gsdmsr prepare``: the world is normalised already, and this file gives its bound."""
+
+MASK_KEYS = {MASK: "mask_path", MOVING: "motion_mask_path"}
+"""Name of a signal to the key of a frame that names its file."""
 
 TEST_EVERY = 8
 """Without lists of frames every 8th, from the first on, is for testing."""
 
 
 def matches(folder: Path) -> bool:
-    """Tell whether ``folder`` holds one JSON file of all frames, and none per split."""
+    """Return whether ``folder`` holds one JSON file of all frames, and none per split."""
     return (folder / SIGN).is_file() and not (folder / "transforms_train.json").is_file()
 
 
@@ -53,8 +56,8 @@ def read(folder: Path) -> Scene:
     names = checks.unique_names(view.name for view in views)
     views = [replace(view, name=name) for view, name in zip(views, names, strict=True)]
     points, colours = _read_points(folder, document, path)
-    bound, duration = _settled(folder / SETTLED_BY)
-    world = _world.settle(views, points) if bound is None else _world.as_it_is(bound)
+    bound, duration = _declared(folder / DECLARED_BY)
+    world = _world.normalize(views, points) if bound is None else _world.as_it_is(bound)
     return Scene(
         root=folder,
         layout="nerfstudio",
@@ -102,16 +105,12 @@ def _splits(document: dict[str, Any], names: list[str], path: Path) -> list[str 
 
 def _read_view(folder: Path, split: str, time: float, fields: dict[str, Any], where: str) -> View:
     view = transforms.read_view(folder, split, time, fields, where)
-    return replace(
-        view,
-        mask_path=_mask(folder, fields, "mask_path", view, where),
-        moving_path=_mask(folder, fields, "motion_mask_path", view, where),
-    )
+    given = {name: key for name, key in MASK_KEYS.items() if fields.get(key) is not None}
+    masks = {name: _mask(folder, fields, key, view, where) for name, key in given.items()}
+    return replace(view, signals=masks)
 
 
-def _mask(folder: Path, fields: dict[str, Any], key: str, view: View, where: str) -> Path | None:
-    if fields.get(key) is None:
-        return None
+def _mask(folder: Path, fields: dict[str, Any], key: str, view: View, where: str) -> Path:
     mask = checks.picture_path(folder, fields[key], f"{where}: {key}")
     checks.mask_size(mask, image_size(mask), view)
     return mask
@@ -124,8 +123,8 @@ def _read_points(folder: Path, document: dict[str, Any], path: Path) -> _points.
     return _points.read_ply(checks.inner_path(folder, name, f"{path}: ply_file_path"))
 
 
-def _settled(path: Path) -> tuple[float | None, float | None]:
-    """Return the bound of a world that ``gsdmsr prepare`` has settled, and its duration [s]."""
+def _declared(path: Path) -> tuple[float | None, float | None]:
+    """Return the bound of a world that ``gsdmsr prepare`` has normalised, and its duration [s]."""
     if not path.is_file():
         return None, None
     document = checks.read_json(path)

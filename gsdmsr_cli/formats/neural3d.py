@@ -1,4 +1,4 @@
-"""Neural 3D Video (N3V, DyNeRF): ``poses_bounds.npy`` and a video of each camera of a rig.
+"""Reads Neural 3D Video (N3V, DyNeRF): ``poses_bounds.npy`` and a video per camera.
 
 Facts: Li et al. 2022 and LLFF's ``poses_bounds.npy``; the first camera is for testing, and
 pictures are measured at half their size. Frames are decoded once, to where 4D-GS's scripts put them
@@ -16,13 +16,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from gsdmsr_cli.camera import Camera
-from gsdmsr_cli.errors import DataError
 from gsdmsr_cli.formats import _checks as checks
 from gsdmsr_cli.formats import _world
-from gsdmsr_cli.imaging import image_size, resize_area, write_png
-from gsdmsr_cli.scene import Scene, View
-from gsdmsr_cli.video import read_video, video_length
+from gsdmsr_cli.ground.errors import DataError
+from gsdmsr_cli.ground.progress import OnProgress
+from gsdmsr_cli.scene.camera import Camera
+from gsdmsr_cli.scene.imaging import image_size, resize_area, write_png
+from gsdmsr_cli.scene.scene import Scene, View
+from gsdmsr_cli.scene.video import read_video, video_length
 
 SIGN = "poses_bounds.npy and cam00.mp4 or cam00/images"
 
@@ -36,11 +37,11 @@ _PART = ".part"
 
 
 def matches(folder: Path) -> bool:
-    """Tell whether ``folder`` holds the poses of a rig and its videos or their frames."""
+    """Return whether ``folder`` holds the poses of a rig and its videos or their frames."""
     return (folder / "poses_bounds.npy").is_file() and bool(_cameras(folder))
 
 
-def prepare(folder: Path, tell: Callable[[int, int], None]) -> None:
+def prepare(folder: Path, on_progress: OnProgress) -> None:
     """Decode the videos whose frames are not there yet, each to all of its frames or none.
 
     Raises:
@@ -54,7 +55,7 @@ def prepare(folder: Path, tell: Callable[[int, int], None]) -> None:
     def count() -> None:
         nonlocal done
         done += 1
-        tell(done, max(done, total))
+        on_progress(done, max(done, total))
 
     for video in videos:
         _decode(video, _frames_of(folder, video.stem), count)
@@ -91,7 +92,7 @@ def read(folder: Path) -> Scene:
     checks.one_size(views)
     nearest, farthest = float(rows[:, 15].min()), float(rows[:, 16].max())
     one_moment = [view for view in views if view.time == 0]
-    world = _world.settle(one_moment, np.zeros((0, 3)), (nearest, farthest))
+    world = _world.normalize(one_moment, np.zeros((0, 3)), (nearest, farthest))
     return Scene(
         root=folder,
         layout="neural3d",

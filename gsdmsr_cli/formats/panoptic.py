@@ -1,4 +1,4 @@
-"""PanopticSports as Dynamic 3D Gaussians lays it out: ``train_meta.json``, ``ims`` and ``seg``.
+"""Reads PanopticSports of Dynamic 3D Gaussians: ``train_meta.json``, ``ims`` and ``seg``.
 
 Facts: Luiten et al. 2024 and the loader of their code: ``k``, ``w2c`` and ``fn`` are lists by
 moment, then by camera; ``init_pt_cld.npz`` holds x y z, r g b and whether a point moves.
@@ -6,18 +6,19 @@ moment, then by camera; ``init_pt_cld.npz`` holds x y z, r g b and whether a poi
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path, PurePosixPath
 from typing import Any
 from zipfile import BadZipFile
 
 import numpy as np
 
-from gsdmsr_cli.camera import Camera
-from gsdmsr_cli.errors import DataError
 from gsdmsr_cli.formats import _checks as checks
 from gsdmsr_cli.formats import _points, _world
-from gsdmsr_cli.imaging import image_size
-from gsdmsr_cli.scene import Scene, View
+from gsdmsr_cli.ground.errors import DataError
+from gsdmsr_cli.scene.camera import Camera
+from gsdmsr_cli.scene.imaging import image_size
+from gsdmsr_cli.scene.scene import MOVING, Scene, View
 
 SIGN = "train_meta.json"
 
@@ -25,7 +26,7 @@ _SPLITS = ("train", "test")
 
 
 def matches(folder: Path) -> bool:
-    """Tell whether ``folder`` holds the cameras of the train split."""
+    """Return whether ``folder`` holds the cameras of the train split."""
     return (folder / SIGN).is_file()
 
 
@@ -46,7 +47,7 @@ def read(folder: Path) -> Scene:
         raise DataError(f"{paths[0]}: no train frames; at least one is needed")
     checks.one_size(views)
     points, colours = _read_points(folder / "init_pt_cld.npz")
-    world = _world.settle([view for view in views if view.time == 0], points)
+    world = _world.normalize([view for view in views if view.time == 0], points)
     return Scene(
         root=folder,
         layout="panoptic",
@@ -102,16 +103,12 @@ def _read_view(
         time=time,
         split=split,
         image_path=image,
-        moving_path=_mask(folder, name),
     )
-    if view.moving_path is not None:
-        checks.mask_size(view.moving_path, image_size(view.moving_path), view)
-    return view
-
-
-def _mask(folder: Path, name: str) -> Path | None:
-    path = folder / "seg" / PurePosixPath(name).with_suffix(".png")
-    return path if path.is_file() else None
+    mask = folder / "seg" / PurePosixPath(name).with_suffix(".png")
+    if not mask.is_file():
+        return view
+    checks.mask_size(mask, image_size(mask), view)
+    return replace(view, signals={MOVING: mask})
 
 
 def _read_points(path: Path) -> _points.Points:

@@ -1,4 +1,4 @@
-"""One file per path: where the camera goes, and when, while a trained scene is filmed.
+"""Makes camera paths, along which a trained scene is rendered: one module per path.
 
 A path is a module of this package with ``TAKES: frozenset[str]``, which of the fields of
 ``PathOptions`` it takes, and::
@@ -15,11 +15,11 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from gsdmsr_cli import plugins
-from gsdmsr_cli.errors import UsageError, nearest
-from gsdmsr_cli.film import MADE_FPS, VIEWS_FPS, Film, PathOptions, Shot
+from gsdmsr_cli.ground import plugins
+from gsdmsr_cli.ground.errors import UsageError, nearest
 from gsdmsr_cli.paths import _keyframes, _views
-from gsdmsr_cli.scene import SPLITS, Scene
+from gsdmsr_cli.scene.film import MADE_FPS, VIEWS_FPS, Film, PathOptions, Shot
+from gsdmsr_cli.scene.scene import SPLITS, Scene
 
 
 def path_names() -> list[str]:

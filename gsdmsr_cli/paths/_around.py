@@ -1,4 +1,4 @@
-"""Cameras round a point: which way is up, how far and how high the given cameras stand."""
+"""Places cameras around a point, at the distance and height of given cameras."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from gsdmsr_cli.camera import Camera, look_at
+from gsdmsr_cli.scene.camera import Camera, look_at
 
 STEEPEST = math.radians(80)
 """Largest elevation of a made camera; straight above there is no up."""
@@ -17,7 +17,7 @@ STEEPEST = math.radians(80)
 Vector = NDArray[np.float64]
 
 ORIGIN: Vector = np.zeros(3)
-"""What is looked at: formats place what is to be reconstructed round it, see ``Scene.bound``."""
+"""The point that cameras face: formats centre the scene there, see ``Scene.bound``."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,4 +1,4 @@
-"""Films from a JSON file of keyframes: a camera, a moment and, if wished, a second for each."""
+"""Reads a camera path from a JSON file of keyframes."""
 
 from __future__ import annotations
 
@@ -9,20 +9,20 @@ from typing import Any
 
 import numpy as np
 
-from gsdmsr_cli import strict
-from gsdmsr_cli.camera import Camera, look_at
-from gsdmsr_cli.errors import DataError, UsageError
-from gsdmsr_cli.files import read_json
-from gsdmsr_cli.film import MADE_FPS, Film
+from gsdmsr_cli.ground.errors import DataError, UsageError
+from gsdmsr_cli.ground.files import read_json
+from gsdmsr_cli.options import strict
+from gsdmsr_cli.options.strict import require
 from gsdmsr_cli.paths._around import common_up
-from gsdmsr_cli.paths._smooth import Key, through
+from gsdmsr_cli.paths._smooth import Key, interpolate
 from gsdmsr_cli.paths._views import find_view
-from gsdmsr_cli.scene import Scene
-from gsdmsr_cli.strict import require
+from gsdmsr_cli.scene.camera import Camera, look_at
+from gsdmsr_cli.scene.film import MADE_FPS, Film
+from gsdmsr_cli.scene.scene import Scene
 
 FRAMES = 120
 MOST = 100_000
-"""Frames of a film; more are a slip of the pen."""
+"""Frames of a film; more are a typing error."""
 
 Point = tuple[float, float, float]
 
@@ -106,7 +106,7 @@ def film(scene: Scene, path: Path, frames: int | None, fps: float | None) -> Fil
         count = FRAMES if items[0].at is None else round(float(knots[-1]) * rate) + 1
     if count > MOST:
         raise DataError(f"{path}: {count} frames at {rate:g} a second; allowed: up to {MOST}")
-    return Film(path.stem, tuple(through(keys, knots, np.linspace(0, knots[-1], count))), rate)
+    return Film(path.stem, tuple(interpolate(keys, knots, np.linspace(0, knots[-1], count))), rate)
 
 
 def _keyframe(path: Path, index: int, item: Any) -> Keyframe:

@@ -1,4 +1,4 @@
-"""Unit quaternions wxyz as rows of arrays, and smooth ways through rotations."""
+"""Computes with unit quaternions wxyz as rows of arrays, and interpolates rotations."""
 
 from __future__ import annotations
 

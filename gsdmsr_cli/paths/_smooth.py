@@ -1,4 +1,4 @@
-"""Smooth ways through cameras, which keep what all of them look at in the picture."""
+"""Interpolates smoothly between cameras, and keeps what they look at in the picture."""
 
 from __future__ import annotations
 
@@ -9,9 +9,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from gsdmsr_cli.camera import Camera
-from gsdmsr_cli.film import Shot
-from gsdmsr_cli.geometry import quat_to_rotmat
+from gsdmsr_cli.ground.geometry import quat_to_rotmat
 from gsdmsr_cli.paths._quaternions import (
     Floats,
     bezier,
@@ -20,6 +18,8 @@ from gsdmsr_cli.paths._quaternions import (
     quaternion,
     turns,
 )
+from gsdmsr_cli.scene.camera import Camera
+from gsdmsr_cli.scene.film import Shot
 
 STEP = 1e-3
 """Least length between two keys, so that those at the same place are apart in time."""
@@ -27,24 +27,24 @@ STEP = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class Key:
-    """Where the way leads through, and when."""
+    """A camera and a moment that the path passes."""
 
     camera: Camera
     time: float
 
 
-def through(keys: Sequence[Key], knots: Floats, at: Floats) -> list[Shot]:
-    """Return the shots at the places ``at`` of the way through two or more ``keys``.
+def interpolate(keys: Sequence[Key], knots: Floats, at: Floats) -> list[Shot]:
+    """Return the shots at the places ``at`` of the smooth path through two or more ``keys``.
 
     Each camera is taken apart into its rotation, the point on its line of sight that is level with
     the world's origin, and the distance to that point. So cameras that look at the scene from
-    different sides are joined by a way round it, which keeps it in the picture. Size is the first
+    different sides are joined by a path round it, which keeps it in the picture. Size is the first
     camera's; lenses, relative to the height, and time go straight from neighbour to neighbour.
 
     Args:
         keys: what is passed through, exactly.
-        knots: (K,) where on the way the keys lie, ascending.
-        at: (M,) where on the way the shots lie, within the knots.
+        knots: (K,) where on the path the keys lie, ascending.
+        at: (M,) where on the path the shots lie, within the knots.
     """
     cameras = [key.camera for key in keys]
     distances = np.array([[max(float(camera.translation[2]), 0.0)] for camera in cameras])
@@ -64,8 +64,8 @@ def through(keys: Sequence[Key], knots: Floats, at: Floats) -> list[Shot]:
 def lengths(keys: Sequence[Key]) -> Floats:
     """Return the (K - 1,) lengths between neighbours, so that even steps look even.
 
-    The length of the way over the keys' mean distance from the origin, plus the angle turned [rad],
-    plus the time that passes.
+    The length of the path over the keys' mean distance from the origin, plus the angle turned
+    [rad], plus the time that passes.
     """
     centres = np.stack([key.camera.centre for key in keys])
     scale = max(float(np.linalg.norm(centres, axis=1).mean()), 1e-12)
@@ -91,10 +91,10 @@ def hermite(knots: Floats, values: Floats, at: Floats) -> Floats:
 
 
 def turned(knots: Floats, rotations: Floats, at: Floats) -> Floats:
-    """Return the (M, 3, 3) rotations at ``at`` on a smooth way through (K, 3, 3) ones.
+    """Return the (M, 3, 3) rotations at ``at`` on a smooth curve through (K, 3, 3) ones.
 
     The same spline among rotations: Bezier curves of arcs (Shoemake 1985), which between two
-    rotations alone are SLERP. Neighbours are joined the shorter way.
+    rotations alone are SLERP. Neighbours are joined by the shorter arc.
     """
     quats = np.stack([quaternion(rotation) for rotation in rotations])
     steps = np.diff(knots)[:, None]

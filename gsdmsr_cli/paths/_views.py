@@ -1,10 +1,10 @@
-"""The cameras of the data: all of one split as a film, or one found by its name."""
+"""Finds cameras of the data: all views of one split, or one by its name."""
 
 from __future__ import annotations
 
-from gsdmsr_cli.errors import UsageError, nearest
-from gsdmsr_cli.film import Shot
-from gsdmsr_cli.scene import Scene, View
+from gsdmsr_cli.ground.errors import UsageError, nearest
+from gsdmsr_cli.scene.film import Shot
+from gsdmsr_cli.scene.scene import Scene, View
 
 
 def shots(scene: Scene, split: str) -> list[Shot]:

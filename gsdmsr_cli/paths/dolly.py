@@ -1,19 +1,19 @@
-"""A camera that slides straight ahead, from a view towards the middle of the scene."""
+"""A camera path straight ahead, from a view towards the middle of the scene."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 
-from gsdmsr_cli.camera import Camera
-from gsdmsr_cli.errors import UsageError
-from gsdmsr_cli.film import PathOptions, Shot, moments, over_time
+from gsdmsr_cli.ground.errors import UsageError
 from gsdmsr_cli.paths._views import find_view
-from gsdmsr_cli.scene import Scene
+from gsdmsr_cli.scene.camera import Camera
+from gsdmsr_cli.scene.film import PathOptions, Shot, moments, over_time
+from gsdmsr_cli.scene.scene import Scene
 
 TAKES = frozenset({"frames", "views"})
 FRAMES = 120
 REACH = 0.5
-"""Share of the way to the middle of the scene that the camera goes."""
+"""Share of the distance to the middle of the scene that the camera moves."""
 
 
 def shots(scene: Scene, options: PathOptions) -> list[Shot]:

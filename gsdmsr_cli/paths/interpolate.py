@@ -1,21 +1,21 @@
-"""A smooth way through given views, each at its moment."""
+"""A smooth camera path through given views, each at its moment."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from gsdmsr_cli.errors import UsageError
-from gsdmsr_cli.film import PathOptions, Shot
-from gsdmsr_cli.paths._smooth import Key, lengths, through
+from gsdmsr_cli.ground.errors import UsageError
+from gsdmsr_cli.paths._smooth import Key, interpolate, lengths
 from gsdmsr_cli.paths._views import find_view
-from gsdmsr_cli.scene import Scene
+from gsdmsr_cli.scene.film import PathOptions, Shot
+from gsdmsr_cli.scene.scene import Scene
 
 TAKES = frozenset({"frames", "views"})
 FRAMES = 120
 
 
 def shots(scene: Scene, options: PathOptions) -> list[Shot]:
-    """Return the way through the named views, at an even pace.
+    """Return the path through the named views, at an even speed.
 
     Raises:
         UsageError: fewer than two views are named, or there is no such view.
@@ -28,4 +28,4 @@ def shots(scene: Scene, options: PathOptions) -> list[Shot]:
     views = [find_view(scene, name) for name in options.views]
     keys = [Key(view.camera, view.time) for view in views]
     knots = np.concatenate([[0.0], np.cumsum(lengths(keys))])
-    return through(keys, knots, np.linspace(0, knots[-1], options.frames or FRAMES))
+    return interpolate(keys, knots, np.linspace(0, knots[-1], options.frames or FRAMES))

@@ -1,14 +1,14 @@
-"""A circle round the scene, at the mean distance and height of the train cameras."""
+"""A circular camera path around the scene, at the cameras' mean distance and height."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
 
-from gsdmsr_cli.camera import Camera
-from gsdmsr_cli.film import PathOptions, Shot, over_time
 from gsdmsr_cli.paths._around import ORIGIN, Vector, surround
-from gsdmsr_cli.scene import Scene
+from gsdmsr_cli.scene.camera import Camera
+from gsdmsr_cli.scene.film import PathOptions, Shot, over_time
+from gsdmsr_cli.scene.scene import Scene
 
 TAKES = frozenset({"frames"})
 FRAMES = 120
@@ -32,7 +32,7 @@ def orbit(cameras: Sequence[Camera], centre: Vector, count: int) -> list[Camera]
 
     Args:
         cameras: one or more cameras round the scene.
-        centre: (3,) what is looked at [world units].
+        centre: (3,) the point that the cameras face [world units].
         count: number of cameras; the last stands one step before the first.
     """
     around = surround(cameras, centre)

@@ -1,4 +1,4 @@
-"""A spiral over the part of the sphere round the scene from which it was seen."""
+"""A spiral camera path over the directions from which the scene was seen."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from gsdmsr_cli.camera import Camera
-from gsdmsr_cli.film import PathOptions, Shot, moments, over_time
 from gsdmsr_cli.paths._around import ORIGIN, Surround, Vector, perpendicular, surround
-from gsdmsr_cli.scene import Scene
+from gsdmsr_cli.scene.camera import Camera
+from gsdmsr_cli.scene.film import PathOptions, Shot, moments, over_time
+from gsdmsr_cli.scene.scene import Scene
 
 TAKES = frozenset({"frames"})
 FRAMES = 180
@@ -38,7 +38,7 @@ def spiral(cameras: Sequence[Camera], centre: Vector, count: int) -> list[Camera
 
     Args:
         cameras: one or more cameras round the scene.
-        centre: (3,) what is looked at [world units].
+        centre: (3,) the point that the cameras face [world units].
         count: number of cameras.
     """
     around = surround(cameras, centre)

@@ -1,11 +1,11 @@
-"""A camera that stands where a view was taken from, while time goes on."""
+"""A camera path that stays at one view while time runs."""
 
 from __future__ import annotations
 
-from gsdmsr_cli.errors import UsageError
-from gsdmsr_cli.film import PathOptions, Shot, over_time
+from gsdmsr_cli.ground.errors import UsageError
 from gsdmsr_cli.paths._views import find_view
-from gsdmsr_cli.scene import Scene
+from gsdmsr_cli.scene.film import PathOptions, Shot, over_time
+from gsdmsr_cli.scene.scene import Scene
 
 TAKES = frozenset({"frames", "views"})
 FRAMES = 120

@@ -1,31 +1,33 @@
-"""Engines: each draws splats under a camera and is differentiable.
+"""Engines draw splats under a camera and give gradients; one file per engine.
 
 An engine is a module of this package with two functions::
 
     def unavailable(device: str) -> str | None
         # None if the engine can draw tensors on the device, else the reason, one clause
 
-    def rasterize(splats: Splats, camera: Camera, background: Tensor,
+    def rasterize(moment: Moment, camera: Camera, background: Tensor,
                   sh_degree: int | None = None, with_depth: bool = False) -> Frame
         # background is (3,); colours use the first (sh_degree + 1)^2 coefficients, all by default
 
 and, if it can do both in one go faster than one after the other::
 
-    def compare(splats: Splats, camera: Camera, background: Tensor, target: Tensor,
+    def compare(moment: Moment, camera: Camera, background: Tensor, target: Tensor,
                 ssim_weight: float, sh_degree: int | None = None,
                 tile_weights: Tensor | None = None) -> Comparison
-        # what ``training.losses.photometric_loss`` says of the drawn picture; with ssim_weight 0
-        # also of some tiles of it, whose shares of the loss are multiplied by their weights
+        # what ``ops.photometric.photometric_loss`` says of the drawn picture; with ssim_weight 0
+        # also of some tiles of it, whose shares of the loss are multiplied by their weights;
+        # ValueError if the moment has features, which are decoded before anything is compared
 
 or the same of several views at once::
 
-    def compare_views(splats: Sequence[Splats], cameras: Sequence[Camera], background: Tensor,
+    def compare_views(moments: Sequence[Moment], cameras: Sequence[Camera], background: Tensor,
                       targets: Sequence[Tensor], ssim_weight: float, sh_degree: int | None = None,
                       tile_weights: Sequence[Tensor] | None = None,
                       ) -> tuple[Tensor, list[Comparison]]
         # the sum of the losses, and what is to be said of each view; all have one picture size
 
-Gradients reach all five tensors of the splats; ``frame.means2d`` is part of the graph, so that
+Gradients reach all tensors that are read (``Moment.tensors``); splats with a value that is not
+finite are not drawn, and get the gradient zero. ``frame.means2d`` is part of the graph, so that
 ``frame.means2d.retain_grad()`` gives density control its statistic. Every engine is held to
 ``reference`` by tests/raster/test_conformance.py.
 """
@@ -37,11 +39,11 @@ from typing import NamedTuple, Protocol, cast, runtime_checkable
 
 from torch import Tensor
 
-from gsdmsr_cli import plugins
-from gsdmsr_cli.camera import Camera
-from gsdmsr_cli.errors import DataError, UsageError
-from gsdmsr_cli.frame import Frame
-from gsdmsr_cli.splats import Splats
+from gsdmsr_cli.gaussians.frame import Frame
+from gsdmsr_cli.gaussians.moment import Moment
+from gsdmsr_cli.ground import plugins
+from gsdmsr_cli.ground.errors import DataError, UsageError
+from gsdmsr_cli.scene.camera import Camera
 
 FASTEST_FIRST = ("cuda", "cpu", "reference")
 
@@ -70,13 +72,13 @@ class Engine(Protocol):
 
     def rasterize(
         self,
-        splats: Splats,
+        moment: Moment,
         camera: Camera,
         background: Tensor,
         sh_degree: int | None = None,
         with_depth: bool = False,
     ) -> Frame:
-        """Draw the splats."""
+        """Draw the moment."""
 
 
 @runtime_checkable
@@ -85,7 +87,7 @@ class Comparing(Engine, Protocol):
 
     def compare(
         self,
-        splats: Splats,
+        moment: Moment,
         camera: Camera,
         background: Tensor,
         target: Tensor,
@@ -102,7 +104,7 @@ class ComparingViews(Engine, Protocol):
 
     def compare_views(
         self,
-        splats: Sequence[Splats],
+        moments: Sequence[Moment],
         cameras: Sequence[Camera],
         background: Tensor,
         targets: Sequence[Tensor],

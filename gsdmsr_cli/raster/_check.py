@@ -1,4 +1,4 @@
-"""Whether an engine draws here what the reference draws: asked before a GPU is relied on."""
+"""Checks that an engine draws on this machine what the reference draws, before a GPU is used."""
 
 from __future__ import annotations
 
@@ -9,11 +9,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsdmsr_cli.camera import Camera, look_at
-from gsdmsr_cli.errors import GsdmsrError
-from gsdmsr_cli.frame import Frame
+from gsdmsr_cli.gaussians.frame import Frame
+from gsdmsr_cli.gaussians.moment import Moment
+from gsdmsr_cli.gaussians.splats import NAMES, Splats
+from gsdmsr_cli.ground.errors import GsdmsrError
+from gsdmsr_cli.ground.splatting_constants import TILE, tile_grid
+from gsdmsr_cli.ops.photometric.twin import ssim
 from gsdmsr_cli.raster import Comparison, reference
-from gsdmsr_cli.splats import NAMES, Splats
+from gsdmsr_cli.scene.camera import Camera, look_at
 
 PICTURE, GRADIENT = 1e-4, 1e-2
 """Largest mean error of a pixel, and relative error of a gradient in the L2 norm. Both are far
@@ -21,6 +24,9 @@ above rounding: single pixels may jump where alpha is next to its cut-off."""
 
 _COUNT, _WIDTH, _HEIGHT = 60, 52, 37
 _BACKGROUND = torch.tensor([0.2, 0.5, 0.9])
+
+_LOSSES = {"loss": (0.0, False), "SSIM loss": (0.2, False), "loss of weighted tiles": (0.0, True)}
+"""By name the weight of SSIM, and whether tiles are weighted."""
 
 
 def disagreement(
@@ -33,27 +39,31 @@ def disagreement(
         device: where its tensors lie.
     """
     exact = _drawn(reference.rasterize, "cpu", torch.float64)
-    true = _compared(_distance, "cpu", torch.float64)
     try:
-        found = _drawn(draw, device, torch.float32)
-        ours = _compared(compare, device, torch.float32)
+        wrong = _error(_drawn(draw, device, torch.float32), exact, "picture")
+        for name, how in _LOSSES.items():
+            exact = _compared(_compare_exactly, "cpu", torch.float64, *how)
+            found = _compared(compare, device, torch.float32, *how)
+            wrong = wrong or _error(found, exact, name)
     except (GsdmsrError, RuntimeError) as failure:
         return f"it fails a test drawing: {str(failure).splitlines()[0]}"
+    return wrong
+
+
+def _error(found: list[Tensor], exact: list[Tensor], what: str) -> str | None:
+    """Return how a value and its gradients by the stored tensors err, one clause, or None."""
     if not (found[0].cpu() - exact[0]).abs().mean() <= PICTURE:
-        return "the picture of a test drawing is wrong"
-    if not (ours[0].cpu() - true[0]).abs() <= PICTURE:
-        return "the loss of a test drawing is wrong"
-    pairs = zip(NAMES * 2, found[1:] + ours[1:], exact[1:] + true[1:], strict=True)
-    for name, gradient, truth in pairs:
+        return f"the {what} of a test drawing is wrong"
+    for name, gradient, truth in zip(NAMES, found[1:], exact[1:], strict=True):
         if not (gradient.cpu() - truth).norm() <= GRADIENT * truth.norm():
-            return f"the gradient of {name} of a test drawing is wrong"
+            return f"the gradient of {name} by the {what} of a test drawing is wrong"
     return None
 
 
 def _drawn(draw: Callable[..., Frame], device: str, dtype: torch.dtype) -> list[Tensor]:
     """Return a picture with its depth, and the gradients of a weighted sum of its values."""
     rng, splats = _generator(), _splats(device, dtype)
-    frame = draw(splats, _camera(), _BACKGROUND.to(device, dtype), None, True)
+    frame = draw(Moment(splats), _camera(), _BACKGROUND.to(device, dtype), None, True)
     assert frame.depth is not None
     parts = [frame.rgb, frame.alpha[..., None], frame.depth[..., None]]
     picture = torch.cat(parts, dim=2)
@@ -62,20 +72,42 @@ def _drawn(draw: Callable[..., Frame], device: str, dtype: torch.dtype) -> list[
     return [picture.detach(), *gradients]
 
 
-def _compared(compare: Callable[..., Comparison], device: str, dtype: torch.dtype) -> list[Tensor]:
-    """Return the mean distance from a target, and its gradients."""
+def _compared(
+    compare: Callable[..., Comparison],
+    device: str,
+    dtype: torch.dtype,
+    ssim_weight: float,
+    weighted: bool,
+) -> list[Tensor]:
+    """Return the loss against a target, and its gradients."""
     splats, shape = _splats(device, dtype), (3, _HEIGHT, _WIDTH)
     target = torch.randint(256, shape, generator=_generator(), dtype=torch.uint8).to(device)
-    loss = compare(splats, _camera(), _BACKGROUND.to(device, dtype), target, 0.0).loss
+    rows, columns = tile_grid(_WIDTH, _HEIGHT)
+    weights = (torch.arange(rows * columns) % 3).to(device, dtype) if weighted else None
+    background = _BACKGROUND.to(device, dtype)
+    given = Moment(splats), _camera(), background, target, ssim_weight, None, weights
+    loss = compare(*given).loss
     return [loss.detach(), *torch.autograd.grad(loss, [*splats.tensors().values()])]
 
 
-def _distance(
-    splats: Splats, camera: Camera, background: Tensor, target: Tensor, _ssim_weight: float
+def _compare_exactly(
+    moment: Moment,
+    camera: Camera,
+    background: Tensor,
+    target: Tensor,
+    ssim_weight: float,
+    _sh_degree: None,
+    tile_weights: Tensor | None,
 ) -> Comparison:
     """Compare as the reference would."""
-    rgb = reference.rasterize(splats, camera, background).rgb
-    loss = (rgb - target.permute(1, 2, 0) / 255).abs().mean()
+    drawn = reference.rasterize(moment, camera, background).rgb.permute(2, 0, 1)
+    wanted = target.to(drawn.dtype) / 255
+    distances = (drawn - wanted).abs()
+    if tile_weights is not None:
+        by_tile = tile_weights.view(tile_grid(camera.width, camera.height))
+        by_pixel = by_tile.repeat_interleave(TILE, 0).repeat_interleave(TILE, 1)
+        distances = distances * by_pixel[: camera.height, : camera.width]
+    loss = (1 - ssim_weight) * distances.mean() + ssim_weight * (1 - ssim(drawn, wanted))
     return Comparison(loss, torch.empty(0), None)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -11,14 +12,16 @@ from torch import Tensor
 from torch.autograd import Function
 from torch.autograd.function import once_differentiable
 
-from gsdmsr_cli.camera import Camera
-from gsdmsr_cli.frame import Frame
-from gsdmsr_cli.kernels import binning, blending, harmonics, looking, projection
-from gsdmsr_cli.kernels.jit import threads
+from gsdmsr_cli.backends.cpu.jit import threads
+from gsdmsr_cli.backends.tensors import array
+from gsdmsr_cli.gaussians.frame import Frame
+from gsdmsr_cli.gaussians.moment import Moment
+from gsdmsr_cli.ground.splatting_constants import TILE, tile_grid
+from gsdmsr_cli.ops.rasterize.cpu import binning, blending, harmonics, projection
+from gsdmsr_cli.ops.rasterize.cpu import fused as looking
 from gsdmsr_cli.raster import Comparison
-from gsdmsr_cli.splats import Splats
-from gsdmsr_cli.splatting_constants import TILE, tile_grid
-from gsdmsr_cli.tensors import array
+from gsdmsr_cli.raster._stored import in_groups, refuse_features, stored_of
+from gsdmsr_cli.scene.camera import Camera
 
 
 def unavailable(device: str) -> str | None:
@@ -27,17 +30,16 @@ def unavailable(device: str) -> str | None:
 
 
 def rasterize(
-    splats: Splats,
+    moment: Moment,
     camera: Camera,
     background: Tensor,
     sh_degree: int | None = None,
     with_depth: bool = False,
 ) -> Frame:
-    """Draw float32 splats; see ``gsdmsr_cli.raster``."""
-    degree = splats.degree_up_to(sh_degree)
-    tensors = [tensor.contiguous() for tensor in splats.tensors().values()]
+    """Draw a float32 moment; see ``gsdmsr_cli.raster``."""
+    degree = moment.splats.degree_up_to(sh_degree)
     means2d, conics, depths, opacities, colours, radii, tiles = _Project.apply(
-        camera, degree, *tensors
+        camera, degree, *stored_of(moment)
     )
     bins = binning.bin_splats(
         array(means2d), array(conics), array(depths), array(opacities), array(tiles),
@@ -50,11 +52,25 @@ def rasterize(
     if with_depth:
         as_colour = depths[:, None].expand(-1, 3)
         depth = _Blend.apply(bins, size, *screen, as_colour, torch.zeros(3))[0][..., 0]
-    return Frame(rgb=rgb, alpha=alpha, depth=depth, radii=radii, means2d=means2d)
+    features = None
+    if moment.features is not None:
+        features = _blend_features(bins, size, screen, moment.features)
+    return Frame(rgb, alpha, depth, radii, means2d, features)
+
+
+def _blend_features(
+    bins: binning.Bins, size: tuple[int, int], screen: tuple[Tensor, ...], features: Tensor
+) -> Tensor:
+    """Return the (H, W, F) features, blended three at a time as if they were colours."""
+    planes = [
+        _Blend.apply(bins, size, *screen, group, torch.zeros(3))[0].permute(2, 0, 1)
+        for group in in_groups(features, 3)
+    ]
+    return torch.cat(planes)[: features.shape[1]].permute(1, 2, 0)
 
 
 def compare(
-    splats: Splats,
+    moment: Moment,
     camera: Camera,
     background: Tensor,
     target: Tensor,
@@ -62,14 +78,14 @@ def compare(
     sh_degree: int | None = None,
     tile_weights: Tensor | None = None,
 ) -> Comparison:
-    """Draw float32 splats and compare, in one call; see ``gsdmsr_cli.raster``."""
+    """Draw a float32 moment and compare, in one call; see ``gsdmsr_cli.raster``."""
+    refuse_features(moment)
     if tile_weights is not None and ssim_weight > 0:
         raise ValueError("tiles cannot be weighted where SSIM counts, whose windows overlap them")
-    degree = splats.degree_up_to(sh_degree)
-    tensors = [tensor.contiguous() for tensor in splats.tensors().values()]
+    degree = moment.splats.degree_up_to(sh_degree)
     weights = torch.empty(0) if tile_weights is None else tile_weights.contiguous()
     loss, on_screen, errors = _Look.apply(
-        camera, degree, background, target, ssim_weight, weights, *tensors
+        camera, degree, background, target, ssim_weight, weights, *stored_of(moment)
     )
     return Comparison(loss, on_screen, errors if ssim_weight == 0 else None)
 
@@ -77,6 +93,16 @@ def compare(
 def _view(camera: Camera) -> tuple[NDArray[np.float32], NDArray[np.float32], int, int]:
     intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy], np.float32)
     return camera.world_to_camera[:3].astype(np.float32), intrinsics, camera.width, camera.height
+
+
+def _arrays(tensors: Sequence[Tensor | None]) -> tuple[Any, ...]:
+    """Return what ``stored_of`` does, or its gradients, as kernels take them.
+
+    What is not read is empty, but axes stay None: that chooses the kernel.
+    """
+    *five, axes = tensors
+    unread = np.empty((0, 0), np.float32)
+    return *(unread if t is None else array(t) for t in five), None if axes is None else array(axes)
 
 
 class _Look(Function):
@@ -91,18 +117,20 @@ class _Look(Function):
         target: Tensor,
         ssim_weight: float,
         tile_weights: Tensor,
-        *stored: Tensor,
+        means: Tensor,
+        *others: Tensor | None,
     ) -> tuple[Tensor, Tensor, Tensor]:
-        gradients = [torch.empty_like(tensor) for tensor in stored]
-        on_screen = torch.empty(len(stored[0]), 2)
+        stored = means, *others
+        gradients = [None if tensor is None else torch.empty_like(tensor) for tensor in stored]
+        on_screen = torch.empty(len(means), 2)
         rows, columns = tile_grid(camera.width, camera.height)
         errors = torch.empty(rows * columns, dtype=torch.float64)
         view, intrinsics, width, height = _view(camera)
         loss = looking.look(
-            *map(array, stored), (degree + 1) ** 2, view, intrinsics,
+            *_arrays(stored), (degree + 1) ** 2, view, intrinsics,
             camera.centre.astype(np.float32), width, height, array(background.contiguous()),
             array(target), float(ssim_weight), threads(), array(tile_weights), array(errors),
-            *map(array, gradients), array(on_screen),
+            *_arrays(gradients), array(on_screen),
         )  # fmt: skip
         ctx.gradients = gradients
         ctx.mark_non_differentiable(on_screen, errors)
@@ -112,7 +140,7 @@ class _Look(Function):
     @once_differentiable  # type: ignore[untyped-decorator]
     def backward(ctx: Any, d_loss: Tensor, *_: Any) -> tuple[Tensor | None, ...]:
         scale = float(d_loss)
-        passed = (g if scale == 1.0 else g * scale for g in ctx.gradients)
+        passed = (g if g is None or scale == 1.0 else g * scale for g in ctx.gradients)
         return None, None, None, None, None, None, *passed
 
 
@@ -125,23 +153,24 @@ class _Project(Function):
         camera: Camera,
         degree: int,
         means: Tensor,
-        quats: Tensor,
-        log_scales: Tensor,
+        quats: Tensor | None,
+        log_scales: Tensor | None,
         logit_opacities: Tensor,
         sh: Tensor,
+        axes: Tensor | None,
     ) -> tuple[Tensor, ...]:
         n = len(means)
         means2d, conics, colours = (torch.empty(n, k) for k in (2, 3, 3))
         depths, opacities, radii = (torch.empty(n) for _ in range(3))
         tiles = torch.empty(n, dtype=torch.int32)
-        stored = [array(t) for t in (means, quats, log_scales, logit_opacities, sh)]
+        stored = _arrays((means, quats, log_scales, logit_opacities, sh, axes))
         projected = [array(t) for t in (means2d, conics, depths, opacities, radii, tiles)]
         projection.project(*stored, *_view(camera), *projected)
         count, centre = (degree + 1) ** 2, camera.centre.astype(np.float32)
-        harmonics.colour(stored[0], stored[4], count, centre, array(opacities), array(colours))
+        harmonics.colour(array(means), array(sh), count, centre, array(opacities), array(colours))
         ctx.camera, ctx.count, ctx.centre = camera, count, centre
         ctx.save_for_backward(
-            means, quats, log_scales, logit_opacities, sh, conics, opacities, colours
+            means, quats, log_scales, logit_opacities, sh, axes, conics, opacities, colours
         )
         ctx.mark_non_differentiable(radii, tiles)
         ctx.set_materialize_grads(True)
@@ -159,15 +188,16 @@ class _Project(Function):
         *_: Any,
     ) -> tuple[Tensor | None, ...]:
         saved = ctx.saved_tensors
-        means, quats, log_scales, _logits, sh, conics, opacities, colours = map(array, saved)
-        gradients = [torch.empty_like(tensor) for tensor in saved[:5]]
-        d_means, d_quats, d_log_scales, d_logit_opacities, d_sh = map(array, gradients)
+        means, quats, log_scales, _logits, sh, axes = _arrays(saved[:6])
+        conics, opacities, colours = map(array, saved[6:])
+        gradients = [None if t is None else torch.empty_like(t) for t in saved[:6]]
+        d_means, d_quats, d_log_scales, d_logit_opacities, d_sh, d_axes = _arrays(gradients)
         incoming = [
             array(d.contiguous()) for d in (d_means2d, d_conics, d_depths, d_opacities, d_colours)
         ]
         projection.project_backward(
-            means, quats, log_scales, *_view(ctx.camera), conics, opacities, *incoming[:4],
-            d_means, d_quats, d_log_scales, d_logit_opacities,
+            means, quats, log_scales, axes, *_view(ctx.camera), conics, opacities, *incoming[:4],
+            d_means, d_quats, d_log_scales, d_logit_opacities, d_axes,
         )  # fmt: skip
         harmonics.colour_backward(
             means, sh, ctx.count, ctx.centre, opacities, colours, incoming[4], d_means, d_sh

@@ -11,13 +11,16 @@ from torch import Tensor
 from torch.autograd import Function
 from torch.autograd.function import once_differentiable
 
-from gsdmsr_cli.camera import Camera
-from gsdmsr_cli.cuda import stages
-from gsdmsr_cli.cuda.availability import missing
-from gsdmsr_cli.frame import Frame
+from gsdmsr_cli.backends.cuda.availability import missing
+from gsdmsr_cli.gaussians.frame import Frame
+from gsdmsr_cli.gaussians.moment import Moment
+from gsdmsr_cli.gaussians.splats import Splats
+from gsdmsr_cli.ops.rasterize.cuda import stages
 from gsdmsr_cli.raster import Comparison
 from gsdmsr_cli.raster._check import disagreement
-from gsdmsr_cli.splats import Splats
+from gsdmsr_cli.raster._check_operations import operations_disagreement
+from gsdmsr_cli.raster._stored import in_groups, refuse_features, stored_of
+from gsdmsr_cli.scene.camera import Camera
 
 
 def unavailable(device: str) -> str | None:
@@ -32,41 +35,57 @@ def unavailable(device: str) -> str | None:
 
 @cache
 def _disagreement() -> str | None:
-    return disagreement(rasterize, compare, "cuda")
+    return disagreement(rasterize, compare, "cuda") or operations_disagreement("cuda")
 
 
 def rasterize(
-    splats: Splats,
+    moment: Moment,
     camera: Camera,
     background: Tensor,
     sh_degree: int | None = None,
     with_depth: bool = False,
 ) -> Frame:
-    """Draw float32 splats; see ``gsdmsr_cli.raster``.
+    """Draw a float32 moment; see ``gsdmsr_cli.raster``.
 
     Where gradients are wanted nothing waits for the GPU; see ``cuda.room`` for what that may cost.
     """
-    views, stored = stages.views_of([camera]), _stored(splats)
-    exact = not (torch.is_grad_enabled() and any(t.requires_grad for t in stored))
+    views, read = stages.views_of([camera]), moment.tensors().values()
+    exact = not (torch.is_grad_enabled() and any(t.requires_grad for t in read))
     means2d, shapes, paints, radii, keys, counts = _Project.apply(
-        views, _terms(splats, sh_degree), *stored
+        views, _terms(moment.splats, sh_degree), *stored_of(moment)
     )
     projected = stages.Projected(means2d, shapes, paints, radii, keys, counts)
     bins = stages.bin_splats(views, projected, exact)
     rgb, alpha, *depth = _Blend.apply(
         views, bins, _to(background, means2d), with_depth, means2d, shapes, paints
     )
+    features = None
+    if moment.features is not None:
+        features = _blend_features(views, bins, means2d, shapes, moment.features)
     return Frame(
         rgb=rgb[0].permute(1, 2, 0),
         alpha=alpha[0],
         depth=depth[0][0] if depth else None,
         radii=radii,
         means2d=means2d,
+        features=features,
     )
 
 
+def _blend_features(
+    views: stages.Views, bins: stages.Bins, means2d: Tensor, shapes: Tensor, features: Tensor
+) -> Tensor:
+    """Return the (H, W, F) features, blended four at a time as if they were colour and depth."""
+    planes = []
+    for group in in_groups(features, 4):
+        paints, nothing = group.contiguous(), group.new_zeros(3)
+        first, _, last = _Blend.apply(views, bins, nothing, True, means2d, shapes, paints)
+        planes += [first[0], last]
+    return torch.cat(planes)[: features.shape[1]].permute(1, 2, 0)
+
+
 def compare(
-    splats: Splats,
+    moment: Moment,
     camera: Camera,
     background: Tensor,
     target: Tensor,
@@ -74,15 +93,15 @@ def compare(
     sh_degree: int | None = None,
     tile_weights: Tensor | None = None,
 ) -> Comparison:
-    """Draw float32 splats and compare, without waiting for the GPU; see ``gsdmsr_cli.raster``."""
+    """Draw a float32 moment and compare, without waiting for the GPU; see ``gsdmsr_cli.raster``."""
     weights = None if tile_weights is None else [tile_weights]
-    given = [splats], [camera], background, [target], ssim_weight, sh_degree, weights
+    given = [moment], [camera], background, [target], ssim_weight, sh_degree, weights
     loss, (view,) = compare_views(*given)
     return view._replace(loss=loss)
 
 
 def compare_views(
-    splats: Sequence[Splats],
+    moments: Sequence[Moment],
     cameras: Sequence[Camera],
     background: Tensor,
     targets: Sequence[Tensor],
@@ -93,8 +112,8 @@ def compare_views(
     """Draw and compare several views at once, each as ``compare`` does.
 
     Args:
-        splats: of each view, such as one model's at several times; what is the very same tensor in
-            all of them is read in place, what differs is copied.
+        moments: of each view, such as one model's at several times; what is the very same tensor
+            in all of them is read in place, what differs is copied. All have axes or none has.
         cameras: of each view, all of one picture size.
         background, ssim_weight, sh_degree: of all views.
         targets, tile_weights: of each view.
@@ -104,29 +123,33 @@ def compare_views(
         losses that have none.
 
     Raises:
-        ValueError: there are no views, more than ``MOST_VIEWS``, or they differ in size.
+        ValueError: there are no views, more than ``MOST_VIEWS``, or they differ in size; some but
+            not all moments have axes; or one has features.
     """
     if tile_weights is not None and ssim_weight > 0:
         raise ValueError("tiles cannot be weighted where SSIM counts, whose windows overlap them")
-    parts = zip(*(own.tensors().values() for own in splats), strict=True)
-    stored = [_together(part) for part in parts]
+    for moment in moments:
+        refuse_features(moment)
+    views = stages.views_of(cameras)
+    stored = [_together(part) for part in zip(*map(stored_of, moments), strict=True)]
+    first = moments[0].splats
     loss, losses, on_screen, errors = _Look.apply(
-        stages.views_of(cameras), _terms(splats[0], sh_degree), _to(background, stored[0]),
+        views, _terms(first, sh_degree), _to(background, first.means),
         targets, ssim_weight, None if tile_weights is None else torch.cat([*tile_weights]), *stored,
     )  # fmt: skip
-    each = zip(losses, on_screen.view(len(splats), -1, 2), errors, strict=True)
+    each = zip(losses, on_screen.view(len(moments), -1, 2), errors, strict=True)
     return loss, [Comparison(*view[:2], None if ssim_weight > 0 else view[2]) for view in each]
 
 
-def _together(tensors: Sequence[Tensor]) -> Tensor:
+def _together(tensors: Sequence[Tensor | None]) -> Tensor | None:
     """Return the one tensor that all views share, or all of them stacked."""
-    first = tensors[0]
-    shared = all(tensor is first for tensor in tensors)
-    return first.contiguous() if shared else torch.stack([*tensors])
-
-
-def _stored(splats: Splats) -> list[Tensor]:
-    return [tensor.contiguous() for tensor in splats.tensors().values()]
+    there = [tensor for tensor in tensors if tensor is not None]
+    if not there:
+        return None
+    if len(there) < len(tensors):
+        raise ValueError("moments with axes and without cannot be drawn at once")
+    shared = all(tensor is there[0] for tensor in there)
+    return there[0] if shared else torch.stack(there)
 
 
 def _terms(splats: Splats, sh_degree: int | None) -> int:
@@ -142,7 +165,8 @@ class _Project(Function):
     """Stored splats to screen positions, shapes and paints."""
 
     @staticmethod
-    def forward(ctx: Any, views: stages.Views, terms: int, *stored: Tensor) -> tuple[Tensor, ...]:
+    def forward(ctx: Any, views: stages.Views, terms: int, *tensors: Any) -> tuple[Tensor, ...]:
+        stored = stages.Stored(*tensors)
         projected = stages.project(views, stored, terms)
         ctx.views, ctx.terms = views, terms
         ctx.save_for_backward(*stored, projected.shapes, projected.paints, projected.radii)
@@ -155,10 +179,10 @@ class _Project(Function):
     def backward(
         ctx: Any, d_means2d: Tensor, d_shapes: Tensor, d_paints: Tensor, *_: Any
     ) -> tuple[Tensor | None, ...]:
-        *stored, shapes, paints, radii = ctx.saved_tensors
+        *tensors, shapes, paints, radii = ctx.saved_tensors
         given = d_means2d.contiguous(), d_shapes.contiguous(), d_paints.contiguous()
         gradients = stages.project_backward(
-            ctx.views, stored, ctx.terms, (shapes, paints, radii), given
+            ctx.views, stages.Stored(*tensors), ctx.terms, (shapes, paints, radii), given
         )
         return None, None, *gradients
 
@@ -210,8 +234,9 @@ class _Look(Function):
         targets: Sequence[Tensor],
         ssim_weight: float,
         tile_weights: Tensor | None,
-        *stored: Tensor,
+        *tensors: Any,
     ) -> tuple[Tensor, ...]:
+        stored = stages.Stored(*tensors)
         found = stages.project(views, stored, terms)
         bins = stages.bin_splats(views, found, exact=False)
         projected = found.means2d, found.shapes, found.paints
@@ -237,5 +262,7 @@ class _Look(Function):
     @once_differentiable  # type: ignore[untyped-decorator]
     def backward(ctx: Any, d_loss: Tensor, *_: Any) -> tuple[Tensor | None, ...]:
         # always multiplied: whether the slope is 1 would have to be waited for
-        passed = torch._foreach_mul(ctx.gradients, d_loss)
+        there = [gradient for gradient in ctx.gradients if gradient is not None]
+        scaled = iter(torch._foreach_mul(there, d_loss))
+        passed = (None if gradient is None else next(scaled) for gradient in ctx.gradients)
         return None, None, None, None, None, None, *passed

@@ -1,4 +1,4 @@
-"""The oracle: a plain torch engine without tiles, to which every other engine is held."""
+"""The reference engine: plain torch without tiles, to which every other engine is compared."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
-from gsdmsr_cli.camera import Camera
-from gsdmsr_cli.frame import Frame
-from gsdmsr_cli.geometry import covariance, sh_basis
-from gsdmsr_cli.splats import Splats
-from gsdmsr_cli.splatting_constants import (
+from gsdmsr_cli.gaussians.frame import Frame
+from gsdmsr_cli.gaussians.moment import Moment
+from gsdmsr_cli.gaussians.splats import Splats
+from gsdmsr_cli.ground.geometry import covariance, sh_basis
+from gsdmsr_cli.ground.splatting_constants import (
     ALPHA_MAX,
     ALPHA_MIN,
     DILATION,
@@ -21,6 +21,7 @@ from gsdmsr_cli.splatting_constants import (
     NEAR,
     TRANSMITTANCE_STOP,
 )
+from gsdmsr_cli.scene.camera import Camera
 
 PAIRS_AT_ONCE = 1 << 21
 """Pixel-splat pairs that are blended at a time; bounds the memory, not the result."""
@@ -43,46 +44,51 @@ def unavailable(device: str) -> str | None:
 
 
 def rasterize(
-    splats: Splats,
+    moment: Moment,
     camera: Camera,
     background: Tensor,
     sh_degree: int | None = None,
     with_depth: bool = False,
 ) -> Frame:
-    """Draw the splats in the dtype and on the device of their tensors.
+    """Draw the moment in the dtype and on the device of its tensors.
 
     The formulas are those of 3DGS (Kerbl et al. 2023) with EWA projection (Zwicker et al. 2001).
     Splats that are not drawn have radius 0, means2d 0 and a zero gradient.
 
     Args:
-        splats: N splats.
+        moment: N splats.
         camera: gives the H x W pixels.
         background: (3,) colour behind the splats.
         sh_degree: highest degree of the harmonics used, all that are stored by default.
         with_depth: whether to blend camera z too.
     """
-    degree = splats.degree_up_to(sh_degree)
-    rows, radii = _drawn(splats, camera)
-    drawn = splats.take(rows)
+    degree = moment.splats.degree_up_to(sh_degree)
+    rows, radii = _drawn(moment, camera)
+    drawn = moment.take(rows)
     projected = project(drawn, camera)
     # Blending reads the screen means through the frame's tensor, so that this has their gradient.
-    means2d = torch.zeros_like(splats.means[:, :2]).index_put((rows,), projected.means2d)
+    means2d = torch.zeros_like(moment.splats.means[:, :2]).index_put((rows,), projected.means2d)
     projected = projected._replace(means2d=means2d[rows])
-    features = _colours(drawn, camera, degree)
+    channels = [_colours(drawn.splats, camera, degree)]
     if with_depth:
-        features = torch.cat([features, projected.depths.unsqueeze(-1)], -1)
-    blended, alpha = _blend(projected, features, camera)
+        channels.append(projected.depths.unsqueeze(-1))
+    if drawn.features is not None:
+        channels.append(drawn.features)
+    blended, alpha = _blend(projected, torch.cat(channels, -1), camera)
     rgb = blended[..., :3] + (1 - alpha).unsqueeze(-1) * background.to(blended)
-    return Frame(rgb, alpha, blended[..., 3] if with_depth else None, radii, means2d)
+    depth = blended[..., 3] if with_depth else None
+    features = None if drawn.features is None else blended[..., 3 + with_depth :]
+    return Frame(rgb, alpha, depth, radii, means2d, features)
 
 
-def project(splats: Splats, camera: Camera) -> Projection:
+def project(moment: Moment, camera: Camera) -> Projection:
     """Project the Gaussians with the Jacobian of the pinhole at their means.
 
     Inside the Jacobian x/z is clamped to FRUSTUM_MARGIN times half the image's width over fx,
     symmetric about the optical axis as in 3DGS also where the principal point is off-centre, and
     y/z likewise. A clamped slope is a constant: no gradient passes through it.
     """
+    splats, axes = moment.splats, moment.axes
     rotation = splats.means.new_tensor(camera.rotation)
     x, y, z = (splats.means @ rotation.T + splats.means.new_tensor(camera.translation)).unbind(-1)
     limit_x = FRUSTUM_MARGIN * 0.5 * camera.width / camera.fx
@@ -92,7 +98,8 @@ def project(splats: Splats, camera: Camera) -> Projection:
     zero = torch.zeros_like(z)
     jacobian = torch.stack([camera.fx / z, zero, dx_dz, zero, camera.fy / z, dy_dz], -1)
     to_screen = jacobian.reshape(-1, 2, 3) @ rotation
-    covs2d = to_screen @ covariance(splats.quats, splats.log_scales) @ to_screen.mT
+    covs = covariance(splats.quats, splats.log_scales) if axes is None else axes @ axes.mT
+    covs2d = to_screen @ covs @ to_screen.mT
     return Projection(
         means2d=torch.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], -1),
         covs2d=covs2d + DILATION * torch.eye(2).to(covs2d),
@@ -102,18 +109,18 @@ def project(splats: Splats, camera: Camera) -> Projection:
 
 
 @torch.no_grad()
-def _drawn(splats: Splats, camera: Camera) -> tuple[Tensor, Tensor]:
+def _drawn(moment: Moment, camera: Camera) -> tuple[Tensor, Tensor]:
     """Return the rows that are drawn, (M,) from front to back, and all radii, (N,) [px].
 
-    A splat is drawn if all its stored values are finite, it is in front of the near plane, the
-    determinant of its screen covariance is finite and positive, and the box around the ellipse
+    A splat is drawn if all its values that are read are finite, it is in front of the near plane,
+    the determinant of its screen covariance is finite and positive, and the box around the ellipse
     where its alpha is at least ALPHA_MIN touches the image. The radius is the larger half side of
     that box.
     """
-    seen = project(splats, camera)
+    seen = project(moment, camera)
     det = _det(seen.covs2d)
     keep = (seen.depths > NEAR) & (seen.opacities >= ALPHA_MIN) & (det > 0) & det.isfinite()
-    for tensor in splats.tensors().values():
+    for tensor in moment.tensors().values():
         keep &= tensor.isfinite().unsqueeze(-1).flatten(1).all(-1)
     mahalanobis2 = 2 * (seen.opacities / ALPHA_MIN).log()
     variances = seen.covs2d.diagonal(dim1=-2, dim2=-1)

@@ -1,1 +1,1 @@
-"""The report of an evaluation that people look at: one HTML file that needs nothing else."""
+"""Writes the results of an evaluation as one HTML file that needs no other files."""

@@ -1,4 +1,4 @@
-"""Pieces of HTML; figures carry the value that they round, and where it stands in the report."""
+"""Builds HTML tables and figures; each figure carries its unrounded value."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The report as one HTML file: no network, no other files, light and dark, narrow and wide."""
+"""Builds the HTML page of an evaluation: one file, no network, light and dark."""
 
 from __future__ import annotations
 
@@ -10,24 +10,24 @@ from gsdmsr_cli.evaluation import summary
 from gsdmsr_cli.evaluation.catalogue import METRICS
 from gsdmsr_cli.evaluation.gates import Verdict
 from gsdmsr_cli.evaluation.summary import Document, value_of
+from gsdmsr_cli.reporting.frames import ReportFrame
 from gsdmsr_cli.reporting.markup import at, bars, figure, table, terms
 from gsdmsr_cli.reporting.plots import Log, plots
-from gsdmsr_cli.reporting.stills import Still
 from gsdmsr_cli.reporting.viewer import viewer
-from gsdmsr_cli.scene import SPLITS
+from gsdmsr_cli.scene.scene import SPLITS
 
 _POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'unsafe-inline'"
 
 _TILE_LPIPS = ("lpips_alex", "lpips_vgg", "lpips_squeeze")
 """The first of these that has a value is shown large."""
 
-_STAGES = {
+_TIMINGS = {
     "load_s": "reading pictures",
     "compile_s": "preparing kernels",
-    "stages_s.look": "drawing and gradients",
-    "stages_s.learn": "optimiser",
-    "stages_s.grow": "growing and pruning",
-    "stages_s.watch": "watching a view",
+    "stages_s.gradients": "drawing and gradients",
+    "stages_s.optimizer": "optimiser",
+    "stages_s.population": "growing and pruning",
+    "stages_s.validation": "drawing the validation view",
     "stages_s.save": "checkpoints",
     "stages_s.other": "other",
 }
@@ -43,7 +43,7 @@ def page(
     document: Document,
     verdicts: Sequence[Verdict],
     log: Log,
-    stills: Sequence[Still],
+    shown: Sequence[ReportFrame],
     full: float,
 ) -> str:
     """Return the page.
@@ -53,7 +53,7 @@ def page(
         document: the content of ``metrics.json``.
         verdicts: on what was asked of it.
         log: of the training.
-        stills: frames to show, worst first.
+        shown: frames to show, worst first.
         full: see ``viewer``.
     """
     about = document["protocol"]
@@ -65,7 +65,7 @@ def page(
     )
     charts = "".join(f'<div class="card chart">{chart}</div>' for chart in plots(document, log))
     costs = _time(document) + _storage(document)
-    frames = viewer(document, stills, full)
+    frames = viewer(document, shown, full)
     body = [
         _section("", _verdicts(verdicts)),
         _section("Figures", f'<div class="grid">{_scores(document)}{_splits(document)}</div>'),
@@ -218,10 +218,10 @@ def _gap(document: Document) -> str:
 def _time(document: Document) -> str:
     rows = [
         (name, f"{figure(document, f'training.{path}', '.1f')} s", value)
-        for path, name in _STAGES.items()
+        for path, name in _TIMINGS.items()
         if (value := at(document, f"training.{path}")) is not None
     ]
-    return f'<div class="card"><h3>Time by stage of the training</h3>{bars(rows)}</div>'
+    return f'<div class="card"><h3>Time of the training by part</h3>{bars(rows)}</div>'
 
 
 def _storage(document: Document) -> str:

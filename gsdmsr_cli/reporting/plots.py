@@ -1,13 +1,13 @@
-"""The charts of a report: what its figures were over the scene's time, and over the training's."""
+"""Draws the charts of an evaluation: scores over the scene's time, and over training."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from gsdmsr_cli.charts import Line, line_chart
 from gsdmsr_cli.evaluation import summary
 from gsdmsr_cli.evaluation.summary import Document
+from gsdmsr_cli.ground.charts import Line, line_chart
 
 SIZE = (440, 300)
 """Of a chart, such that its text can be read on a phone."""

@@ -1,1 +1,1 @@
-"""The training loop and what it is made of."""
+"""Trains a model on the pictures of a scene."""

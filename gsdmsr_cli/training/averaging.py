@@ -6,10 +6,12 @@ rate had fallen further, and serves unseen views and times better (Izmailov et a
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
+
+from gsdmsr_cli.model.parameter import Parameter
 
 EVERY = 10
 """Steps between two values that are averaged: neighbours differ too little to be worth a pass."""
@@ -28,21 +30,23 @@ class Average:
         self.count = 0
 
     @torch.no_grad()
-    def add(self, tensors: Mapping[str, Tensor]) -> None:
-        """Add present values; the names and shapes are those of the first call."""
+    def add(self, parameters: Sequence[Parameter]) -> None:
+        """Add present values; the names and shapes are those of the first call.
+
+        Of what is not trained, the last values count.
+        """
         self.count += 1
-        for name, tensor in tensors.items():
-            if self.count == 1:
+        for name, tensor, rate in ((p.name, p.tensor, p.rate) for p in parameters):
+            if self.count == 1 or rate is None:
                 self.tensors[name] = tensor.detach().clone()
             else:
                 self.tensors[name].lerp_(tensor, 1 / self.count)
 
-    def take(self, names: Iterable[str], rows: Tensor) -> None:
-        """Follow a resize of the named tensors that adds no splats."""
-        for name in names:
-            if name in self.tensors:
-                self.tensors[name] = self.tensors[name][rows]
+    def take(self, name: str, rows: Tensor) -> None:
+        """Follow a resize of the named tensor that adds no splats."""
+        if name in self.tensors:
+            self.tensors[name] = self.tensors[name][rows]
 
-    def forget(self) -> None:
+    def clear(self) -> None:
         """Begin anew: after a change that makes earlier values worthless."""
         self.tensors, self.count = {}, 0

@@ -1,4 +1,4 @@
-"""The training loop: step until the clock has run out, tell and save on the way."""
+"""The training loop: steps until the clock has run out, with reports and checkpoints."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ import torch
 from torch import Tensor
 
 from gsdmsr_cli.evaluation.metrics import PSNR_CAP, psnr, quantize
-from gsdmsr_cli.evaluation.protocol import Studio
-from gsdmsr_cli.run import Run
-from gsdmsr_cli.scene import Scene, View
+from gsdmsr_cli.evaluation.protocol import ViewRenderer
+from gsdmsr_cli.runs.run import Run
+from gsdmsr_cli.scene.scene import Scene, View
 from gsdmsr_cli.training.trainer import Trainer
 
-TELL_EVERY = 2.0
+REPORT_EVERY = 2.0
 """Longest time between two reports [s]."""
 
-TELL_EVERY_PROGRESS = 0.02
+REPORT_EVERY_PROGRESS = 0.02
 """Most progress between two reports; whichever comes first."""
 
 
@@ -38,12 +38,13 @@ class Report:
         progress: in [0, 1].
         loss: mean over the steps since the last report, or None if none was finite.
         splats: number of splats.
-        salient: share of them that the optimiser attends to in full; 1 without a gate.
+        salient: share of them that the optimiser updates in full; 1 without a gate.
         still: share of them that stand still.
+        dropped: splats dropped since the training began, because values were not finite.
         ms_per_step: mean wall time since the last report [ms].
-        psnr: of the watched view, rounded to 8 bits [dB], or None if it is not a number.
-        split: which split the watched view belongs to, "val" or, in scenes without, "train".
-        stages: seconds since the last report by what they went into, see ``training.stages``.
+        psnr: of the validation view, rounded to 8 bits [dB], or None if it is not a number.
+        split: which split the validation view belongs to, "val" or, in scenes without, "train".
+        timings: seconds since the last report by what they went into, see ``TIMINGS``.
     """
 
     step: int
@@ -53,10 +54,11 @@ class Report:
     splats: int
     salient: float
     still: float
+    dropped: int
     ms_per_step: float
     psnr: float | None
     split: str
-    stages: Mapping[str, float]
+    timings: Mapping[str, float]
 
     @property
     def remaining(self) -> float:
@@ -73,56 +75,67 @@ class Report:
             "splats": self.splats,
             "salient": round(self.salient, 4),
             "still": round(self.still, 4),
+            "dropped": self.dropped,
             "ms_per_step": round(self.ms_per_step, 3),
             f"{self.split}_psnr": self.psnr,
-            "stages": {stage: round(seconds, 4) for stage, seconds in self.stages.items()},
+            "timings": {name: round(seconds, 4) for name, seconds in self.timings.items()},
         }
 
 
-def train(trainer: Trainer, run: Run, tell: Callable[[Report], None]) -> bool:
+def train(trainer: Trainer, run: Run, on_report: Callable[[Report], None]) -> bool:
     """Train to the end of the clock; return False if Ctrl-C ended it earlier.
 
-    Every report goes to the run's log and to ``tell``. Checkpoints are saved at the preset's
+    Every report goes to the run's log and to ``on_report``. Checkpoints are saved at the preset's
     interval and at either end. Reports and checkpoints count as time of training.
 
     Raises:
         GsdmsrError: the training has diverged; the last checkpoint is kept.
         DataError: a picture cannot be read, or a checkpoint not be written.
     """
-    watch = _Watch(trainer, watched_view(trainer.scene))
-    interval = 60 * trainer.preset.training.checkpoint_minutes
+    interval = _Interval(trainer, validation_view(trainer.scene))
+    save_every = 60 * trainer.preset.training.checkpoint_minutes
     with _ctrl_c() as wanted:
         trainer.clock.start()
-        watch.begin()
+        interval.begin()
         saved = time.perf_counter()
         while trainer.clock.progress < 1 and not wanted.is_set():
-            watch.count(trainer.step().loss)
-            if watch.is_due():
-                _tell(watch.report(), run, tell)
-            if time.perf_counter() - saved >= interval:
+            interval.count(trainer.step().loss)
+            if interval.is_due():
+                _log(interval.report(), run, on_report)
+            if time.perf_counter() - saved >= save_every:
                 with trainer.stopwatch.of("save"):
-                    run.save(trainer.checkpoint())
+                    _save(trainer, run)
                 saved = time.perf_counter()
-        if watch.losses:
-            _tell(watch.report(), run, tell)
-        run.save(trainer.checkpoint())
+        if interval.losses:
+            _log(interval.report(), run, on_report)
+        _save(trainer, run)
     return not wanted.is_set()
 
 
-def watched_view(scene: Scene) -> View:
+def validation_view(scene: Scene) -> View:
     """Return the view whose PSNR is reported: the middle one of val, or of train without a val."""
     views = [view for view in scene.views if view.split == "val"] or scene.split("train")
     return views[len(views) // 2]
 
 
-def _tell(report: Report, run: Run, tell: Callable[[Report], None]) -> None:
+def _save(trainer: Trainer, run: Run) -> None:
+    """Save a checkpoint, of splats with finite values alone.
+
+    Raises:
+        GsdmsrError: the training has diverged; the earlier checkpoint stays.
+    """
+    trainer.population.drop_not_finite()
+    run.save(trainer.checkpoint())
+
+
+def _log(report: Report, run: Run, on_report: Callable[[Report], None]) -> None:
     run.log(report.entry())
-    tell(report)
+    on_report(report)
 
 
 @dataclass
-class _Watch:
-    """What has happened since the last report."""
+class _Interval:
+    """The steps since the last report."""
 
     trainer: Trainer
     view: View
@@ -140,11 +153,11 @@ class _Watch:
         self.losses.append(loss)
 
     def is_due(self) -> bool:
-        """Tell whether it is time for a report."""
+        """Return whether it is time for a report."""
         clock = self.trainer.clock
         return (
-            clock.elapsed - self.elapsed >= TELL_EVERY
-            or clock.progress - self.progress >= TELL_EVERY_PROGRESS
+            clock.elapsed - self.elapsed >= REPORT_EVERY
+            or clock.progress - self.progress >= REPORT_EVERY_PROGRESS
         )
 
     def report(self) -> Report:
@@ -157,6 +170,7 @@ class _Watch:
         losses = torch.stack(self.losses).tolist()
         if self.trainer.device.type != "cpu":
             self.trainer.count(losses)
+            self.trainer.population.drop_not_finite()
         finite = [loss for loss in losses if math.isfinite(loss)]
         report = Report(
             step=clock.step,
@@ -166,20 +180,20 @@ class _Watch:
             splats=len(model.splats),
             salient=_share(self.trainer.saliency.high),
             still=1 - model.moving / len(model.splats),
+            dropped=self.trainer.population.dropped,
             ms_per_step=1000 * (clock.elapsed - self.elapsed) / len(self.losses),
             psnr=self._psnr(),
             split=self.view.split,
-            stages=self.trainer.stopwatch.take(),
+            timings=self.trainer.stopwatch.take(),
         )
         self.begin()
         return report
 
     def _psnr(self) -> float | None:
-        observer = self.trainer.observer
-        model, background = self.trainer.result(), observer.background
-        studio = Studio(model, observer.engine, observer.pictures, background)
-        with self.trainer.stopwatch.of("watch"):
-            value = psnr(quantize(studio.draw(self.view)), studio.true(self.view))
+        training, model = self.trainer.renderer, self.trainer.result()
+        renderer = ViewRenderer(model, training.engine, training.pictures, training.background)
+        with self.trainer.stopwatch.of("validation"):
+            value = psnr(quantize(renderer.draw(self.view)), renderer.true(self.view))
         return None if math.isnan(value) else min(value, PSNR_CAP)
 
 
@@ -189,7 +203,7 @@ def _share(rows: Tensor) -> float:
 
 @contextmanager
 def _ctrl_c() -> Iterator[threading.Event]:
-    """Turn Ctrl-C into an event, so that no step is cut in two; a second Ctrl-C does interrupt."""
+    """Turn Ctrl-C into an event, so that a step is finished; a second Ctrl-C does interrupt."""
     wanted = threading.Event()
     if threading.current_thread() is not threading.main_thread():
         yield wanted  # only the main thread may handle signals

@@ -1,4 +1,4 @@
-"""MS-DGO: the optimiser attends to the splats that still change (GS-DMSR, Lu et al. 2026, 4.1).
+"""Finds the splats that the optimiser still changes (MS-DGO in GS-DMSR, Lu et al. 2026, 4.1).
 
 The saliency of a splat is the weighted length of its last step, S = |W (a(t) - a(t - 1))|_1 over
 position, rotation, scale and colour. Splats of low saliency have converged: their steps are scaled
@@ -14,9 +14,9 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from gsdmsr_cli.geometry import SH_C0
-from gsdmsr_cli.preset import SaliencyOptions
-from gsdmsr_cli.splats import Splats
+from gsdmsr_cli.gaussians.splats import Splats
+from gsdmsr_cli.ground.geometry import SH_C0
+from gsdmsr_cli.options.preset import SaliencyOptions
 
 SPARSE_EVERY = 8
 """Interval at which splats of low saliency take their step where the gate is "sparse" [steps]."""
@@ -53,13 +53,13 @@ class Saliency:
         }[gate]
         return torch.where(self.high, 1.0, low)
 
-    def teachers(self, step: int) -> Tensor | None:
-        """Return which (N,) splats the motion's shared fields learn from, or None for all."""
+    def gradient_mask(self, step: int) -> Tensor | None:
+        """Return which (N,) splats that have gradients for shared fields, or None for all."""
         every = self.options.field_every
         return None if every and step % every == 0 else self.high
 
     def observe(self, now: Tensor, seen: Tensor) -> Tensor:
-        """Take note of a step and return which splats (N,) have gone from low to high.
+        """Update the scores by a step; return which splats (N,) have gone from low to high.
 
         Args:
             now: (N,) saliency of the step, see ``step_saliency``.
@@ -87,9 +87,9 @@ class Saliency:
         """Follow a resize; rows that are ``fresh`` (M,) begin high, in grace."""
         for name in _STATE:
             setattr(self, name, getattr(self, name)[rows])
-        self.pardon(fresh)
+        self.restart(fresh)
 
-    def pardon(self, rows: Tensor) -> None:
+    def restart(self, rows: Tensor) -> None:
         """Let the splats ``rows`` (N,) bool begin anew: high, in grace."""
         self.scores[rows] = self.options.threshold
         self.high[rows] = True

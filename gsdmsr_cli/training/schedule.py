@@ -1,4 +1,4 @@
-"""Progress of a training and what follows from it: a preset serves steps and minutes alike."""
+"""The progress of a training, by its steps or by its time, and schedules of it."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import math
 import time
 from dataclasses import dataclass, field
 
-from gsdmsr_cli.preset import TrainingOptions, parse_duration
+from gsdmsr_cli.options.preset import TrainingOptions, parse_duration
 
 
 def log_linear(ends: tuple[float, float], progress: float) -> float:

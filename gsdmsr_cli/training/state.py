@@ -1,4 +1,4 @@
-"""The state of a training as named tensors: those of each of its parts, under a prefix."""
+"""Saves and restores the parts of a training as named tensors, each part under a prefix."""
 
 from __future__ import annotations
 

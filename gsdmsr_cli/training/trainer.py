@@ -1,4 +1,4 @@
-"""One training: its state, and what a step does with it."""
+"""One training of a model: its state, and what each step does."""
 
 from __future__ import annotations
 
@@ -9,39 +9,41 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from gsdmsr_cli.errors import GsdmsrError
-from gsdmsr_cli.model import MOVED_BY, MOVING, STORED, STORED_AS, Model, load_model
-from gsdmsr_cli.motion import start_motion
-from gsdmsr_cli.pictures import Pictures
-from gsdmsr_cli.preset import BACKGROUNDS, Preset
+from gsdmsr_cli.ground.errors import GsdmsrError
+from gsdmsr_cli.model.building import check_layers, load_model, start_model
+from gsdmsr_cli.model.model import MOVING, Model
+from gsdmsr_cli.ops.finite import all_finite, not_finite
+from gsdmsr_cli.options.preset import BACKGROUNDS, Preset
 from gsdmsr_cli.raster import Engine
-from gsdmsr_cli.run import Checkpoint
-from gsdmsr_cli.scene import Scene, View
-from gsdmsr_cli.splats import NAMES
-from gsdmsr_cli.training import averaging
-from gsdmsr_cli.training.density import DensityStatistics, grow_and_prune, reset_opacities
-from gsdmsr_cli.training.initial import facts_of, initial_splats
-from gsdmsr_cli.training.look import Look, Observer, Stage
-from gsdmsr_cli.training.optimizer import Adam, Gate
-from gsdmsr_cli.training.saliency import Saliency, step_saliency
-from gsdmsr_cli.training.schedule import log_linear, new_clock
-from gsdmsr_cli.training.sensitivity import MOST_VIEWS, most_sensitive, picture_sensitivity
-from gsdmsr_cli.training.stages import Stopwatch
-from gsdmsr_cli.training.state import Part, below, gather, scatter
-from gsdmsr_cli.training.stillness import motion_saliency
-from gsdmsr_cli.training.team import Team
-from gsdmsr_cli.training.tiles import TileSampler
+from gsdmsr_cli.runs.run import Checkpoint
+from gsdmsr_cli.scene.camera import Camera
+from gsdmsr_cli.scene.pictures import Pictures
+from gsdmsr_cli.scene.scene import Scene
+from gsdmsr_cli.training import averaging, snapshot
+from gsdmsr_cli.training.gating import gates_of, observe_step
+from gsdmsr_cli.training.gradients.compare import gradients_of
+from gsdmsr_cli.training.gradients.phase import Order, Phase, ViewGradients
+from gsdmsr_cli.training.gradients.renderer import TrainingRenderer
+from gsdmsr_cli.training.gradients.tiles import TileSampler
+from gsdmsr_cli.training.gradients.workers import WorkerPool
+from gsdmsr_cli.training.losses import start_term
+from gsdmsr_cli.training.optimizer import Adam
+from gsdmsr_cli.training.population import Tick, start_events
+from gsdmsr_cli.training.rates import learning_rates
+from gsdmsr_cli.training.resizing import Population
+from gsdmsr_cli.training.saliency import Saliency
+from gsdmsr_cli.training.schedule import new_clock
+from gsdmsr_cli.training.starting.initial import facts_of, initial_splats
+from gsdmsr_cli.training.timings import Stopwatch
 
 PENALTY_EVERY = 4
 """Regularisers are slow to change and cost a pass over all planes: every 4th step, 4 times."""
 
-PRUNE_EVERY = 500
-"""Interval of pruning alone, once growing has ended [steps]."""
-
 PATIENCE = 20
 """Consecutive steps without a finite loss after which training gives up."""
 
-_LAST = "last."
+Penalty = tuple[Tensor, Sequence[Tensor | None]]
+"""Regularisers, (), and their gradients by every trained tensor."""
 
 
 @dataclass(frozen=True)
@@ -52,14 +54,16 @@ class Step:
 
 
 class Trainer:
-    """A model in training on the train views of a scene; a context that ends its helpers.
+    """A model in training on the train views of a scene; a context that ends its workers.
 
     Attributes:
-        model: what is trained.
+        population: the model and what is kept for each of its splats.
         clock: steps, time and progress.
-        observer: how views are looked at.
-        team: who looks at them; this process alone until ``hire``.
-        stopwatch: what the time goes into.
+        renderer: renders views and goes backward.
+        workers: the processes that take gradients; this one alone until ``start_workers``.
+        events: what changes the splats after a step, by name, in their order.
+        stopwatch: adds up what the time goes into.
+        queue: rows of the views that come next, the last one first.
     """
 
     def __init__(
@@ -72,274 +76,206 @@ class Trainer:
     ) -> None:
         self.scene, self.preset, self.device = scene, preset, torch.device(device)
         self.views = scene.split("train")
-        self.observer = Observer(preset, engine, pictures, device)
-        self.team = Team(self.observer, self.views)
-        self.radius = scene.radius
+        self.renderer = TrainingRenderer(preset, engine, pictures, self.views, device)
+        self.workers = WorkerPool(self.renderer)
         self.generator = torch.Generator().manual_seed(preset.training.seed)
         background = torch.tensor(BACKGROUNDS[preset.data.background])
         splats = initial_splats(scene, preset.splats, pictures, background, self.generator)
         self.facts = facts_of(scene, splats)
-        motion = start_motion(preset.motion, self.facts, len(splats), self.generator)
-        precision = preset.training.precision
-        self.model = Model(splats, motion, precision=precision).to(device)
+        model = start_model(
+            splats, preset.motion, preset.layers, self.facts, self.generator,
+            precision=preset.training.precision,
+        )  # fmt: skip
         self.optimizer = Adam()
-        self.saliency = Saliency(len(self.model.splats), preset.saliency, device)
-        self.statistics = DensityStatistics(len(self.model.splats), device)
+        self.saliency = Saliency(len(splats), preset.saliency, device)
+        self.events = start_events(preset)
         self.tiles = TileSampler(preset.training.tiles_per_view)
-        self.average = averaging.Average()
+        self.population = self.populate(model.to(device))
         self.clock = new_clock(preset.training)
         self.stopwatch = Stopwatch()
-        self._queue: list[int] = []
-        self._rounds = self._resets = self._thinnings = 0
-        self._moving = False
+        self.queue: list[int] = []
+        self._times = scene.train_times
         self._skipped = 0
+
+    def populate(self, model: Model) -> Population:
+        """Return a model with what is kept for each of its splats, which begins anew."""
+        given = self.optimizer, self.saliency, self.scene.radius, self.preset.density.cap
+        drawing = self.renderer.engine, self.renderer.background
+        return Population(
+            model, *given, self.generator, *drawing, self._shots, self.workers.all_threads
+        )
+
+    @property
+    def model(self) -> Model:
+        """What is trained."""
+        return self.population.model
 
     def __enter__(self) -> Trainer:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self.team.dismiss()
+        self.workers.stop()
 
-    def hire(self, prepare: Callable[[], object]) -> None:
-        """Get helpers for a step's views, until the context ends; see ``Team.hire``."""
+    def start_workers(self, prepare: Callable[[], object]) -> None:
+        """Get workers for a step's views, until the context ends; see ``WorkerPool.start``."""
         capacity = max(self.preset.density.cap, len(self.model.splats))
-        self.team.hire(self.model, capacity, self.preset.training.views_per_step, prepare)
+        self.workers.start(self.model, capacity, self.preset.training.views_per_step, prepare)
 
     def step(self) -> Step:
-        """Choose views, look at each, add up their gradients, learn, grow and prune."""
+        """Choose views, take their gradients, let Adam step, let events change the splats."""
         progress = self.clock.progress
         self._enter_phase(progress)
-        rows = [self._next_row() for _ in range(self.preset.training.views_per_step)]
-        tensors = self.model.tensors()
+        orders = self._choose_views(progress)
         gated = self._is_gated(progress)
-        teachers = self.saliency.teachers(self.clock.step) if gated else None
-        stage = Stage(progress, self._moving, teachers)
-        tile_weights = [self._choose_tiles(row, progress) for row in rows]
-        penalised = self._moving and self.clock.step % PENALTY_EVERY == 0
-        with self.stopwatch.of("look"):
-            looks, penalty = self.team.look(
-                self.model, rows, stage, tile_weights,
-                lambda: self._penalise(tensors, self.views[rows[0]]) if penalised else None,
-            )  # fmt: skip
-        value = torch.stack([look.loss for look in looks]).mean()
-        gradients = [look.gradients for look in looks]
-        if penalty is not None:
-            value = value + PENALTY_EVERY * penalty[0]
-            weight = PENALTY_EVERY * len(looks)
-            gradients.append([None if part is None else part * weight for part in penalty[1]])
-        for tensor, *parts in zip(tensors.values(), *gradients, strict=True):
-            tensor.grad = _sum(parts)
+        mask = self.saliency.gradient_mask(self.clock.step) if gated else None
+        phase = Phase(progress, self.population.moving, mask)
+        with self.stopwatch.of("gradients"):
+            views, penalty = self.workers.gradients(
+                self.model, orders, phase, lambda: self._penalty(orders[0], progress)
+            )
+        loss = _set_gradients(self.model, views, penalty)
         self.clock.step += 1
-        # a GPU is not waited for: there the optimiser looks at the loss, and `count` is told later
-        if value.is_cpu and not self.count([value.item()]):
-            return self._skip(value)
-        for row, weights, look in zip(rows, tile_weights, looks, strict=True):
-            if weights is not None and look.errors is not None:
-                self.tiles.learn(row, weights, look.errors.cpu())
-        if progress < self.preset.density.until:
-            for look in looks:
-                self.statistics.observe(look.on_screen, *look.size)
-        with self.stopwatch.of("learn"):
-            self._learn(tensors, progress, value, looks if gated else None)
-        with self.stopwatch.of("grow"):
-            self._control_density(progress)
-            self._settle(progress)
+        loss = self._checked(loss)
+        if loss.is_cpu and not self.count([loss.item()]):
+            return self._skip(loss)
+        self._record(orders, views, progress, loss)
+        with self.stopwatch.of("optimizer"):
+            self._update(progress, loss, views if gated else None)
+        with self.stopwatch.of("population"):
+            self._apply_events(Tick(self.clock.step, progress))
         if self.clock.step % averaging.EVERY == 0:
             self._average(progress)
-        return Step(value)
+        return Step(loss)
 
-    def _choose_tiles(self, row: int, progress: float) -> Tensor | None:
-        """Return the tile weights of a view of the next step, or None for the whole picture."""
-        tiles = self.observer.tiles(self.views[row], progress)
-        if not 0 < self.tiles.count < tiles:
-            return None
-        return self.tiles.choose(row, tiles, self.generator)
+    def _enter_phase(self, progress: float) -> None:
+        """Drop splats that are not finite, and start the motion after the static phase."""
+        if self.device.type == "cpu":  # a GPU is not waited for: there it is done at reports
+            self.population.drop_not_finite()
+        options = self.preset.training
+        over = progress >= options.static_until or self.clock.step >= options.static_steps
+        if over and not self.population.moving:
+            self.population.begin_moving()
+        self.model.advance(progress)
 
-    def _average(self, progress: float) -> None:
-        if progress >= self.preset.training.average_from:
-            self.average.add(self.model.tensors())
-        else:
-            self.average.forget()  # a resumed training may have gone back in progress
-
-    def result(self) -> Model:
-        """Return the model that the training has led to: the average where there is one yet."""
-        if not self.average.count:
-            return self.model
-        tensors = self.average.tensors | {MOVING: torch.tensor(self.model.moving)}
-        return self._load(tensors, self.clock.progress)
-
-    def _load(self, tensors: Mapping[str, Tensor], progress: float) -> Model:
-        precision = self.preset.training.precision
-        model = load_model(tensors, self.preset.motion, self.facts, progress, precision)
-        return model.to(self.device)
-
-    def _penalise(
-        self, tensors: Mapping[str, Tensor], view: View
-    ) -> tuple[Tensor | float, Sequence[Tensor | None]]:
-        """Return the penalty and its gradients."""
-        penalty = self.model.penalty(view.time, self.generator)
-        if penalty is None:
-            return 0.0, [None] * len(tensors)
-        gradients = torch.autograd.grad(penalty, list(tensors.values()), allow_unused=True)
-        return penalty.detach(), gradients
+    def _choose_views(self, progress: float) -> list[Order]:
+        """Return the views of a step, with all random choices that each needs."""
+        rows = [self._next_row() for _ in range(self.preset.training.views_per_step)]
+        return [self._order(row, progress) for row in rows]
 
     def _next_row(self) -> int:
         """Return the next view of a random order that visits every view before any again."""
-        if not self._queue:
-            self._queue = torch.randperm(len(self.views), generator=self.generator).tolist()
-        return self._queue.pop()
+        if not self.queue:
+            self.queue = torch.randperm(len(self.views), generator=self.generator).tolist()
+        return self.queue.pop()
 
-    def _enter_phase(self, progress: float) -> None:
-        """Start the motion after the static phase, without the momentum of what did not move."""
-        options = self.preset.training
-        over = progress >= options.static_until or self.clock.step >= options.static_steps
-        if over and not self._moving:
-            self._moving = True
-            for name in STORED:
-                self.optimizer.forget(name, second=False)
-            self._root()
-        self.model.motion.advance(progress)
+    def _order(self, row: int, progress: float) -> Order:
+        view, weights, jitter = self.views[row], None, 0.0
+        tiles = self.renderer.tiles(view, progress)
+        if 0 < self.tiles.count < tiles:
+            weights = self.tiles.choose(row, tiles, self.generator)
+        if self.model.needs_jitter:
+            jitter = float(torch.randn((), generator=self.generator))
+        others = self.renderer.other_times(view.time, self._times, self.generator)
+        return Order(row, weights, jitter, others)
 
-    def _rates(self, progress: float) -> dict[str, float]:
-        """Return each tensor's learning rate; schedules begin at ``static_until``."""
-        options = self.preset.optimizer
-        static = self.preset.training.static_until
-        p = (progress - static) / (1 - static) if static < 1 else 0.0
-        groups = {
-            group: log_linear(getattr(options, group), p)
-            for group in (*NAMES, "planes", "network", "embeddings")
-        }
-        groups["means"] *= self.radius
-        rates = {STORED_AS + name: groups[name] for name in NAMES}
-        moving = self.model.motion.groups()
-        return rates | {MOVED_BY + name: groups[group] for name, group in moving.items()}
+    def _penalty(self, order: Order, progress: float) -> Penalty | None:
+        """Return the layers' regularisers, evaluated for one view, and their gradients."""
+        if not self.population.moving or self.clock.step % PENALTY_EVERY:
+            return None
+        view = self.views[order.row]
+        instant = self.model.instant(view.time, self.renderer.camera(view, progress), order.jitter)
+        value = self.model.penalty(instant, self.generator)
+        if value is None:
+            return None
+        return value.detach(), gradients_of(value, self.model)
 
-    def _learn(
-        self,
-        tensors: Mapping[str, Tensor],
-        progress: float,
-        loss: Tensor,
-        watched: Sequence[Look] | None,
+    def _checked(self, loss: Tensor) -> Tensor:
+        """Return the loss, made NaN if a gradient of what all splats share is not finite."""
+        parameters = self.model.parameters()
+        shared = [p.tensor.grad for p in parameters if not p.per_splat]
+        gradients = [gradient for gradient in shared if gradient is not None]
+        if not gradients:
+            return loss
+        if not loss.is_cpu:
+            return loss + not_finite(gradients)
+        return loss if all_finite(gradients) else torch.full_like(loss, math.nan)
+
+    def _record(
+        self, orders: Sequence[Order], views: Sequence[ViewGradients], progress: float, loss: Tensor
     ) -> None:
-        """Let Adam step; where the splats are gated, their saliency follows what was looked at."""
-        gates = {} if watched is None else self._gates(tensors)
-        share = self.preset.optimizer.sh_rest
-        rest = self.model.splats.sh.detach()[:, 1:]
-        before = None if share == 1 else rest.clone()
-        with self.team.all_threads():
-            self.optimizer.step(tensors, self._rates(progress), gates, loss)
-        if before is not None:
-            rest.copy_(torch.lerp(before, rest, share))
-        if watched is not None:
-            self._attend(watched, gates)
+        """Give the errors of tiles and the gradients on the screen to those who choose by them.
+
+        On a GPU, which is not waited for, gradients of a loss () that is not finite become NaN,
+        which does not count.
+        """
+        for order, view in zip(orders, views, strict=True):
+            weights, errors = order.tile_weights, view.tile_errors
+            # errors are waited for, so the loss may be as well
+            if weights is not None and errors is not None and bool(loss.isfinite()):
+                self.tiles.learn(order.row, weights, errors.cpu())
+        if progress < self.preset.density.until:
+            for view in views:
+                on_screen = view.on_screen if loss.is_cpu else view.on_screen * (loss * 0 + 1)
+                self.population.statistics.observe(on_screen, *view.size)
 
     def _is_gated(self, progress: float) -> bool:
         options = self.preset.saliency
-        return options.gate != "none" and self._moving and progress >= options.gate_from
+        moving = self.population.moving
+        return options.gate != "none" and moving and progress >= options.gate_from
 
-    def _gates(self, tensors: Mapping[str, Tensor]) -> dict[str, Gate]:
-        """Return what the rows of all tensors with a row per splat may do in this step."""
-        multipliers = self.saliency.multipliers(self.clock.step)
-        by_name = dict.fromkeys(STORED, multipliers)
-        by_name |= dict.fromkeys(self.model.held_by_motion(), multipliers[: self.model.moving])
-        return {name: Gate(m, torch.zeros_like(tensors[name])) for name, m in by_name.items()}
+    def _update(self, progress: float, loss: Tensor, gated: Sequence[ViewGradients] | None) -> None:
+        """Let Adam step; where splats are gated, given the views, update their saliency by it."""
+        gates = {} if gated is None else gates_of(self.population, self.clock.step)
+        static = self.preset.training.static_until
+        rates = learning_rates(
+            self.model.parameters(), self.preset.optimizer, progress, static, self.scene.radius
+        )
+        share = self.preset.optimizer.sh_rest
+        rest = self.model.splats.sh.detach()[:, 1:]
+        before = None if share == 1 else rest.clone()
+        with self.workers.all_threads():
+            self.optimizer.step(self.model.trained(), rates, gates, loss)
+        if before is not None:
+            rest.copy_(torch.lerp(before, rest, share))
+        if gated is not None:
+            observe_step(self.population, gated, gates, loss)
 
-    def _attend(self, looks: Sequence[Look], gates: Mapping[str, Gate]) -> None:
-        """Let the saliency follow a step."""
-        steps = {name: gates[STORED_AS + name].trace for name in NAMES}
-        raw = self.preset.saliency.units == "raw"
-        now = step_saliency(self.model.splats, steps, raw)
-        seen = torch.stack([look.on_screen for look in looks]).any(dim=2).any(dim=0)
-        woken = self.saliency.observe(now, seen)
-        if woken.is_cpu and not woken.any():
-            return
-        # what they were about to do when they fell asleep is of no use any more
-        self.optimizer.calm(STORED, woken)
-        self.optimizer.calm(self.model.held_by_motion(), woken[: self.model.moving])
+    def _apply_events(self, tick: Tick) -> None:
+        """Apply every event that is due."""
+        for event in self.events.values():
+            if event.due(tick):
+                change = event.apply(self.population, tick)
+                if change is not None:
+                    self.population.resize(change)
 
-    def _control_density(self, progress: float) -> None:
-        options = self.preset.density
-        if self._density_is_due(progress):
-            growing = progress < options.until
-            rows, fresh, grown = grow_and_prune(
-                self.model.splats, self.statistics, options, self.radius, growing, self.generator
-            )
-            if not len(rows):
-                raise GsdmsrError(
-                    f"no splats are left at step {self.clock.step}; lower density.prune_opacity or "
-                    "check that cameras and pictures belong together"
-                )
-            self.model.take(rows)
-            with torch.no_grad():
-                for name, tensor in self.model.splats.tensors().items():
-                    tensor.copy_(getattr(grown, name))
-            self._follow(rows, fresh)
-            if fresh.any():
-                self.average.forget()
-                self._root()
-        if self._resets < len(options.reset_at) and progress >= options.reset_at[self._resets]:
-            self._resets += 1
-            reset_opacities(self.model.splats)
-            self.optimizer.forget(STORED_AS + "logit_opacities")
-            self.average.forget()
-            self.saliency.pardon(torch.ones_like(self.saliency.high))
-        if self._thinnings < len(options.thin_at) and progress >= options.thin_at[self._thinnings]:
-            self._thinnings += 1
-            self._thin()
+    def _average(self, progress: float) -> None:
+        if progress >= self.preset.training.average_from:
+            self.population.average.add(self.model.parameters())
+        else:
+            self.population.average.clear()  # a resumed training may have gone back in progress
 
-    def _thin(self) -> None:
-        """Prune the splats that the training's pictures depend on least."""
-        chosen = torch.randperm(len(self.views), generator=self.generator)[:MOST_VIEWS]
+    def _shots(self, most: int) -> list[tuple[Camera, float]]:
+        """Return up to so many cameras of train views and their times, chosen at random."""
+        chosen = torch.randperm(len(self.views), generator=self.generator)[:most]
         views = [self.views[row] for row in chosen.tolist()]
-        shots = [(self.observer.pictures.camera(view), view.time) for view in views]
-        given = self.observer.engine, shots, self.observer.background, self.generator
-        with self.team.all_threads():
-            scores = picture_sensitivity(self.model, *given)
-        rows = most_sensitive(scores, self.preset.density.thin_share)
-        self.model.take(rows)
-        self._follow(rows, torch.zeros_like(rows, dtype=torch.bool))
+        return [(self.renderer.pictures.camera(view), view.time) for view in views]
 
-    def _root(self) -> None:
-        """Tie the motion to the present splats, if it moves them and cares where they are."""
-        if self._moving:
-            for name in self.model.root():
-                self.optimizer.forget(name)
+    def result(self) -> Model:
+        """Return the model that the training has led to: the average where there is one yet."""
+        average = self.population.average
+        if not average.count:
+            return self.model
+        tensors = average.tensors | {MOVING: torch.tensor(self.model.moving)}
+        return self.load(tensors, self.clock.progress)
 
-    def _density_is_due(self, progress: float) -> bool:
-        """Tell whether to grow and prune, or only to prune, after this step."""
-        options, step = self.preset.density, self.clock.step
-        if step < options.start:
-            return False
-        if progress >= options.until:
-            return step % PRUNE_EVERY == 0
-        if step % options.every or progress * options.rounds < self._rounds * options.until:
-            return False
-        self._rounds += 1
-        return True
-
-    def _follow(self, rows: Tensor, fresh: Tensor) -> None:
-        """Resize what is kept beside the model, which has taken these rows."""
-        held = slice(self.model.moving)
-        self.optimizer.take(STORED, rows, fresh)
-        self.optimizer.take(self.model.held_by_motion(), rows[held], fresh[held])
-        self.average.take(STORED, rows)
-        self.average.take(self.model.held_by_motion(), rows[held])
-        self.statistics = DensityStatistics(len(rows), self.device)
-        self.saliency.take(rows, fresh)
-
-    def _settle(self, progress: float) -> None:
-        """Let splats stand still that hardly move; not while splats are grown or averaged."""
-        options = self.preset.saliency
-        first = max(options.still_from, self.preset.density.until)
-        if not first <= progress < self.preset.training.average_from:
-            return
-        if self.clock.step % options.still_every == 0:
-            saliency, mean = motion_saliency(self.model)
-            order = self.model.settle(saliency < options.still_below, mean)
-            self._follow(order, torch.zeros_like(order, dtype=torch.bool))
+    def load(self, tensors: Mapping[str, Tensor], progress: float) -> Model:
+        """Return the model of saved tensors, on the device."""
+        preset = self.preset
+        given = preset.motion, preset.layers, self.facts, progress, preset.training.precision
+        return load_model(tensors, *given).to(self.device)
 
     def count(self, losses: Sequence[float]) -> bool:
-        """Take note of the losses of steps, and return whether the last is finite.
+        """Count the losses in a row that are not finite; return whether the last is finite.
 
         Raises:
             GsdmsrError: too many in a row are not.
@@ -348,8 +284,9 @@ class Trainer:
             self._skipped = 0 if math.isfinite(loss) else self._skipped + 1
             if self._skipped >= PATIENCE:
                 raise GsdmsrError(
-                    f"the loss is not finite for {PATIENCE} steps up to step {self.clock.step}; "
-                    "the last checkpoint is kept; lower the learning rates with --set optimizer..."
+                    "the loss, or a gradient of what all splats share, is not finite for "
+                    f"{PATIENCE} steps up to step {self.clock.step}; the last checkpoint is kept; "
+                    "lower the learning rates with --set optimizer..."
                 )
         return not self._skipped
 
@@ -359,70 +296,45 @@ class Trainer:
             tensor.grad = None
         return Step(loss)
 
-    def _parts(self) -> dict[str, Part]:
-        """Return what is kept beside the model, by the prefix of its tensors in a checkpoint."""
-        return {
-            "adam.": self.optimizer,
-            "density.": self.statistics,
-            "saliency.": self.saliency,
-            "tiles.": self.tiles,
-        }
-
     def checkpoint(self) -> Checkpoint:
         """Return the result so far and everything needed to go on from here."""
-        tensors = dict(self.model.tensors())
-        if self.average.count:
-            tensors = {_LAST + name: tensor for name, tensor in tensors.items()}
-            tensors |= self.average.tensors
-        if self.model.moving < len(self.model.splats):
-            tensors[MOVING] = torch.tensor(self.model.moving)
-        tensors |= gather(self._parts())
-        tensors["generator"] = self.generator.get_state()
-        state = {
-            "queue": self._queue,
-            "rounds": self._rounds,
-            "resets": self._resets,
-            "thinnings": self._thinnings,
-            "moving": self._moving,
-            "adam_steps": self.optimizer.steps,
-            "averaged": self.average.count,
-        }
-        clock = self.clock
-        return Checkpoint(clock.step, clock.progress, clock.elapsed, tensors, state)
+        return snapshot.take(self)
 
     def restore(self, checkpoint: Checkpoint) -> None:
         """Go on from a checkpoint of the same preset and scene."""
-        state = checkpoint.state
-        tensors = {name: tensor.to(self._home(name)) for name, tensor in checkpoint.tensors.items()}
-        self.average = averaging.Average()
-        self.average.count = int(state["averaged"])
-        last = dict(tensors)
-        if self.average.count:
-            last = below(_LAST, tensors)
-            self.average.tensors = {name: tensors[name] for name in last}
-            if MOVING in tensors:
-                last[MOVING] = tensors[MOVING]
-        self.model = self._load(last, checkpoint.progress)
-        self.statistics = DensityStatistics(len(self.model.splats))
-        scatter(self._parts(), tensors)
-        self.optimizer.steps = {name: int(count) for name, count in state["adam_steps"].items()}
-        self.generator.set_state(tensors["generator"])
-        self._queue = list(state["queue"])
-        self._rounds, self._resets = int(state["rounds"]), int(state["resets"])
-        self._thinnings = int(state.get("thinnings", 0))  # absent before there was such a thing
-        self._moving = bool(state["moving"])
-        self.clock.step, self.clock.before = checkpoint.step, checkpoint.elapsed
+        snapshot.restore(self, checkpoint)
 
-    def _home(self, name: str) -> torch.device:
-        """Return where a checkpoint's tensor belongs: chance and tiles are matters of the CPU."""
-        return torch.device("cpu") if name.startswith(("generator", "tiles.")) else self.device
+
+def check_plugins(preset: Preset) -> None:
+    """Raise UsageError unless there are the motion, layers, events and terms that a preset names.
+
+    Their options are checked as well; no data is needed.
+    """
+    check_layers(preset.motion, preset.layers)
+    start_events(preset)
+    for settings in preset.losses.terms:
+        start_term(settings)
+
+
+def _set_gradients(model: Model, views: Sequence[ViewGradients], penalty: Penalty | None) -> Tensor:
+    """Give the trained tensors the sums of their gradients; return the loss ().
+
+    The loss is the mean over the views. Adam does not care whether it gets a sum or a mean.
+    """
+    loss = torch.stack([view.loss for view in views]).mean()
+    parts = [view.gradients for view in views]
+    if penalty is not None:
+        value, gradients = penalty
+        loss = loss + PENALTY_EVERY * value
+        weight = PENALTY_EVERY * len(views)
+        parts.append([None if part is None else part * weight for part in gradients])
+    for tensor, *own in zip(model.trained().values(), *parts, strict=True):
+        tensor.grad = _sum(own)
+    return loss
 
 
 def _sum(parts: Sequence[Tensor | None]) -> Tensor | None:
-    """Return the sum of the parts that are there, in this order, or None.
-
-    Adam does not care whether it gets the sum or the mean over a step's views.
-    """
+    """Return the sum of the parts that are there, in this order, or None."""
     total: Tensor | None = None
     for part in parts:
         if part is not None:

@@ -11,11 +11,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsdmsr_cli.camera import Camera, look_at
-from gsdmsr_cli.pictures import Pictures
-from gsdmsr_cli.preset import Preset
+from gsdmsr_cli.options.preset import Preset
 from gsdmsr_cli.raster import Engine
-from gsdmsr_cli.scene import Scene, View
+from gsdmsr_cli.scene.camera import Camera, look_at
+from gsdmsr_cli.scene.pictures import Pictures
+from gsdmsr_cli.scene.scene import Scene, View
 from gsdmsr_cli.training.trainer import Trainer
 
 STEPS = 26
@@ -30,7 +30,7 @@ class _GreyPictures(Pictures):
     def __init__(self) -> None:
         super().__init__((1.0, 1.0, 1.0), 1, 0)
 
-    def load(self, view: View) -> Tensor:
+    def decode(self, view: View) -> Tensor:
         return torch.full((3, view.camera.height, view.camera.width), 128, dtype=torch.uint8)
 
 
@@ -53,16 +53,18 @@ def warm_up(
 def warm_up_motion(scene: Scene, preset: Preset, engine: Engine) -> None:
     """Run the kernels of the motion alone, in all its phases.
 
-    For a helper to begin with: what it compiles meanwhile, the training finds in the cache, and
-    the other way round.
+    A worker begins with it: the training and its workers then compile different kernels at the
+    same time, and find the others in the cache.
     """
     with torch.random.fork_rng(devices=[]):
-        model = Trainer(_small(scene), _short(preset), engine, _GreyPictures()).model
+        trainer = Trainer(_small(scene), _short(preset), engine, _GreyPictures())
+        model, view = trainer.model, trainer.views[0]
         for step in range(STEPS):
-            model.motion.advance(step / STEPS)
-            splats = model.at(0.5)
+            model.advance(step / STEPS)
+            instant = model.instant(0.5, trainer.renderer.camera(view, step / STEPS))
+            splats = model.at(instant).splats
             outcome = splats.means.sum() + splats.quats.sum() + splats.log_scales.sum()
-            penalty = model.penalty(0.5, torch.Generator())
+            penalty = model.penalty(instant, torch.Generator())
             torch.autograd.backward([outcome] if penalty is None else [outcome, penalty])
 
 

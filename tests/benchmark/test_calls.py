@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from gsdmsr_cli.benchmark.calls import Line, call, call_side_by_side
-from gsdmsr_cli.errors import GsdmsrError
+from gsdmsr_cli.ground.errors import GsdmsrError
 
 
 def text(path: Path) -> str:

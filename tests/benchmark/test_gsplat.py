@@ -11,10 +11,11 @@ from torch import Tensor
 
 from gsdmsr_cli.benchmark import gsplat
 from gsdmsr_cli.benchmark.cloud import camera, cloud
-from gsdmsr_cli.camera import Camera
-from gsdmsr_cli.geometry import SH_C0
+from gsdmsr_cli.gaussians.moment import Moment
+from gsdmsr_cli.gaussians.splats import Splats
+from gsdmsr_cli.ground.geometry import SH_C0
 from gsdmsr_cli.raster import reference
-from gsdmsr_cli.splats import Splats
+from gsdmsr_cli.scene.camera import Camera
 
 SIZE, COUNT = 24, 90
 
@@ -31,14 +32,14 @@ def rasterization(
     view = Camera(viewmats[0].double().numpy(), fx, fy, cx, cy, width, height)
     sh = ((colors - 0.5) / SH_C0)[:, None]
     splats = Splats(means, quats, scales.log(), opacities.logit(), sh)
-    frame = reference.rasterize(splats, view, backgrounds[0])
+    frame = reference.rasterize(Moment(splats), view, backgrounds[0])
     return frame.rgb[None], frame.alpha[None, ..., None], {}
 
 
 def test_it_draws_what_we_draw() -> None:
     module = SimpleNamespace(rasterization=rasterization)
     found = gsplat.drawing(module, SIZE, COUNT, "cpu")()
-    expected = reference.rasterize(cloud(COUNT), camera(SIZE), torch.ones(3)).rgb
+    expected = reference.rasterize(Moment(cloud(COUNT)), camera(SIZE), torch.ones(3)).rgb
     torch.testing.assert_close(found, expected, atol=1e-4, rtol=0)
 
 

@@ -12,8 +12,8 @@ import pytest
 import torch
 
 from gsdmsr_cli.benchmark.kills import same, survive
-from gsdmsr_cli.errors import DataError
-from gsdmsr_cli.run import Checkpoint
+from gsdmsr_cli.ground.errors import DataError
+from gsdmsr_cli.runs.run import Checkpoint
 
 
 def checkpoint() -> Checkpoint:
@@ -36,7 +36,7 @@ def test_only_the_wall_time_may_differ() -> None:
 
 def test_killed_trainings_end_as_if_left_alone(tiny_scene: Path, tmp_path: Path) -> None:
     line = ["benchmark", "resume", tiny_scene, "--out", tmp_path, "--steps", 200, "--downscale", 1]
-    command = [sys.executable, "-m", "gsdmsr_cli.cli", *map(str, line), "--kills", "2", "--json"]
+    command = [sys.executable, "-m", "gsdmsr_cli", *map(str, line), "--kills", "2", "--json"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
     assert done.returncode == 0, done.stderr
     kills = json.loads(done.stdout)["kills"]

@@ -15,17 +15,17 @@ import pytest
 
 from gsdmsr_cli.benchmark import calls, trials
 from gsdmsr_cli.benchmark.trials import Terms, Trial, all_trials, run_side_by_side, run_trial
-from gsdmsr_cli.errors import DataError, UsageError
-from gsdmsr_cli.machine import cores
-from gsdmsr_cli.preset import load_preset
-from gsdmsr_cli.run import open_run
+from gsdmsr_cli.ground.errors import DataError, UsageError
+from gsdmsr_cli.ground.machine import cores
+from gsdmsr_cli.options.preset import load_preset
+from gsdmsr_cli.runs.run import open_run
 
 TERMS = Terms(downscale=1, background="white", split="test", lpips_weights=None)
 STEPS = 4
 
 
 def gsdmsr(*arguments: object) -> subprocess.CompletedProcess[str]:
-    line = [sys.executable, "-m", "gsdmsr_cli.cli", *map(str, arguments)]
+    line = [sys.executable, "-m", "gsdmsr_cli", *map(str, arguments)]
     return subprocess.run(line, capture_output=True, text=True, timeout=300, check=False)
 
 
@@ -259,7 +259,7 @@ def test_ctrl_c_and_kill_save_the_training_that_is_under_way(
     line = ["benchmark", "scenes", tiny_scene, "--out", out, "--preset", "static", "--steps", 10**7]
     line += ["--jobs", jobs, "--seed", 0, "--seed", 1]
     process = subprocess.Popen(
-        [sys.executable, "-m", "gsdmsr_cli.cli", *map(str, line)],
+        [sys.executable, "-m", "gsdmsr_cli", *map(str, line)],
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True,
     )  # fmt: skip
     begun = [Trial(tiny_scene, "static", 10**7, seed) for seed in range(jobs)]

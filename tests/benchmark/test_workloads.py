@@ -9,30 +9,30 @@ import torch
 
 from gsdmsr_cli.benchmark import workloads
 from gsdmsr_cli.benchmark.cloud import camera, cloud
+from gsdmsr_cli.gaussians.moment import Moment
 from gsdmsr_cli.raster import best_engine
-from gsdmsr_cli.splats import Splats
 
 
 def test_the_cloud_is_in_the_picture_and_the_same_every_time() -> None:
     splats = cloud(500)
     assert all(map(torch.equal, splats.tensors().values(), cloud(500).tensors().values()))
     assert float(splats.means.norm(dim=1).max()) <= 1 + 1e-6
-    frame = best_engine("cpu").rasterize(splats, camera(64), torch.ones(3))
+    frame = best_engine("cpu").rasterize(Moment(splats), camera(64), torch.ones(3))
     assert float((frame.radii > 0).float().mean()) > 0.95
     assert 0.2 < float(frame.alpha.mean()) < 0.9
 
 
 def test_drawing_takes_the_gradients_of_all_that_is_stored(monkeypatch: pytest.MonkeyPatch) -> None:
-    drawn: list[Splats] = []
+    drawn: list[Moment] = []
     engine = best_engine("cpu")
 
     class Watched:
-        def rasterize(self, splats: Splats, *rest: Any) -> Any:
-            drawn.append(splats)
-            for tensor in splats.tensors().values():
+        def rasterize(self, moment: Moment, *rest: Any) -> Any:
+            drawn.append(moment)
+            for tensor in moment.tensors().values():
                 tensor.retain_grad()
                 tensor.register_hook(lambda gradient: lengths.append(float(gradient.norm())))
-            return engine.rasterize(splats, *rest)
+            return engine.rasterize(moment, *rest)
 
     lengths: list[float] = []
     monkeypatch.setattr(workloads, "best_engine", lambda device: Watched())
@@ -42,7 +42,7 @@ def test_drawing_takes_the_gradients_of_all_that_is_stored(monkeypatch: pytest.M
     assert all(tensor.grad is None for tensor in drawn[0].tensors().values())
 
 
-@pytest.mark.parametrize("motion", ["hexplane", "multiscale", "nodes"])
+@pytest.mark.parametrize("motion", ["hexplane", "multiscale", "control_points"])
 def test_a_step_takes_all_gradients_and_moves_nothing(
     motion: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:

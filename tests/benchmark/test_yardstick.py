@@ -11,7 +11,7 @@ import pytest
 
 from gsdmsr_cli.benchmark import yardstick
 from gsdmsr_cli.benchmark.cloud import cloud
-from gsdmsr_cli.errors import DataError
+from gsdmsr_cli.ground.errors import DataError
 
 ITER = """
 import numpy as np

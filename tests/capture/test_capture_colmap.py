@@ -17,12 +17,12 @@ from gsdmsr_cli.capture.child import run_child
 from gsdmsr_cli.capture.colmap import DATABASE
 from gsdmsr_cli.capture.consistency import essential_matrix, rays_of, sampson_distance
 from gsdmsr_cli.capture.features import find_features, write_features
+from gsdmsr_cli.capture.normalize import is_test, upright
 from gsdmsr_cli.capture.options import CAMERA_MODELS, MATCHINGS
 from gsdmsr_cli.capture.pairs import NEIGHBOURS, choose_pairs
 from gsdmsr_cli.capture.reconstruction import lens_of
-from gsdmsr_cli.capture.settle import is_test, upright
-from gsdmsr_cli.errors import GsdmsrError
-from gsdmsr_cli.native import load_pycolmap
+from gsdmsr_cli.ground.errors import GsdmsrError
+from gsdmsr_cli.scene.native import load_pycolmap
 
 PARAMS = {
     "SIMPLE_PINHOLE": [500.0, 320.0, 236.0],

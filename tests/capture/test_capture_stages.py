@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from gsdmsr_cli.capture.stages import Stages
-from gsdmsr_cli.errors import DataError
+from gsdmsr_cli.ground.errors import DataError
 
 
 def test_a_stage_is_made_once_for_each_key(tmp_path: Path) -> None:

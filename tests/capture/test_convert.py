@@ -10,7 +10,7 @@ from datasets import noise, pose, write_dnerf, write_json, write_picture
 from test_prepare import prepare
 
 from gsdmsr_cli.formats import read_scene
-from gsdmsr_cli.imaging import read_image
+from gsdmsr_cli.scene.imaging import read_image
 
 
 def test_a_dnerf_data_set_is_the_same_scene_afterwards(tmp_path: Path) -> None:

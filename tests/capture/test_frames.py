@@ -1,4 +1,4 @@
-"""Which pictures become frames, at which times, and what their notes do to them."""
+"""Which pictures become frames, at which times, and what their EXIF tags do to them."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gsdmsr_cli.capture.exif import FULL_FRAME_DIAGONAL, read_notes, upright
+from gsdmsr_cli.capture.exif import FULL_FRAME_DIAGONAL, read_exif, upright
 from gsdmsr_cli.capture.frames import (
     Candidate,
     choose,
@@ -20,8 +20,8 @@ from gsdmsr_cli.capture.frames import (
     write_frames,
 )
 from gsdmsr_cli.capture.source import Source, find_source
-from gsdmsr_cli.errors import DataError
-from gsdmsr_cli.native import OpenImageIO
+from gsdmsr_cli.ground.errors import DataError
+from gsdmsr_cli.scene.native import OpenImageIO
 
 
 def silent(done: int, total: int) -> None:
@@ -86,10 +86,10 @@ def test_notes_of_a_camera_are_read(tmp_path: Path) -> None:
         tmp_path / "a.jpg", pixels, Orientation=6, Exif_FocalLengthIn35mmFilm=26,
         Exif_DateTimeOriginal="2026:03:01 12:00:05", Exif_SubsecTimeOriginal="25",
     )  # fmt: skip
-    notes = read_notes(tmp_path / "a.jpg")
+    notes = read_exif(tmp_path / "a.jpg")
     assert notes.orientation == 6 and notes.focal == pytest.approx(26 / FULL_FRAME_DIAGONAL)
     cv2.imwrite(str(tmp_path / "plain.png"), pixels)
-    assert read_notes(tmp_path / "plain.png").taken is None
+    assert read_exif(tmp_path / "plain.png").taken is None
     assert notes.taken is not None and notes.taken % 60 == pytest.approx(5.25)
 
 

@@ -15,9 +15,9 @@ from gsdmsr_cli.capture.features import Features
 from gsdmsr_cli.capture.frames import read_frames, write_frames
 from gsdmsr_cli.capture.masks import read_mask, standing, write_given_masks
 from gsdmsr_cli.capture.source import find_source
-from gsdmsr_cli.errors import DataError
 from gsdmsr_cli.formats import read_scene
-from gsdmsr_cli.imaging import read_image
+from gsdmsr_cli.ground.errors import DataError
+from gsdmsr_cli.scene.imaging import read_image
 
 FRAMES = 14
 
@@ -57,7 +57,7 @@ def test_masks_save_the_cameras_from_a_large_thing_that_moves_with_them(tmp_path
     assert quality["frames"]["registered"] == FRAMES and quality["warnings"] == []
     assert quality["masks"]["covered"] == pytest.approx(shots.moving.mean(), abs=0.01)
     for view in read_scene(tmp_path / "scene").views:
-        shown = read_image(view.moving_path)[..., 0] >= 128
+        shown = read_image(view.signals["moving"])[..., 0] >= 128
         camera = view.camera
         assert shown.shape == (camera.height, camera.width)
         assert (shown == shots.moving[int(view.name)]).mean() > 0.98  # undistortion moves edges
@@ -86,7 +86,8 @@ def test_masks_that_are_found_save_the_cameras_as_well(
     assert error_of(tmp_path / "scene", shots) < 0.003
     shared = united = 0
     for view in read_scene(tmp_path / "scene").views:
-        shown, moving = read_image(view.moving_path)[..., 0] >= 128, shots.moving[int(view.name)]
+        shown = read_image(view.signals["moving"])[..., 0] >= 128
+        moving = shots.moving[int(view.name)]
         shared += (shown & moving).sum()
         united += (shown | moving).sum()
     assert shared / united > 0.5  # single frames may fare worse

@@ -17,13 +17,13 @@ import pytest
 import room
 
 from gsdmsr_cli.formats import read_scene
-from gsdmsr_cli.imaging import read_image
+from gsdmsr_cli.scene.imaging import read_image
 
 FRAMES = 14
 
 
 def prepare(*arguments: object) -> subprocess.CompletedProcess[str]:
-    line = [sys.executable, "-m", "gsdmsr_cli.cli", "prepare", *map(str, arguments)]
+    line = [sys.executable, "-m", "gsdmsr_cli", "prepare", *map(str, arguments)]
     return subprocess.run(line, capture_output=True, text=True)
 
 
@@ -54,7 +54,7 @@ def test_cameras_are_where_the_pictures_were_drawn(scene: Path, shots: room.Shot
         assert view.camera.fx == pytest.approx(room.FOCAL * view.camera.width, rel=0.02)
 
 
-def test_the_world_is_upright_and_settled(scene: Path, shots: room.Shots) -> None:
+def test_the_world_is_upright_and_normalized(scene: Path, shots: room.Shots) -> None:
     read = read_scene(scene)
     up = np.mean([-view.camera.rotation[1] for view in read.views], axis=0)
     assert up / np.linalg.norm(up) == pytest.approx([0, 0, 1], abs=1e-6)
@@ -158,7 +158,7 @@ def test_an_interrupted_run_leaves_no_scene_and_the_next_goes_on(
     scene: Path, pictures: Path, tmp_path: Path, how: signal.Signals
 ) -> None:
     out, stages = tmp_path / "scene", tmp_path / "scene.stages"
-    line = [sys.executable, "-m", "gsdmsr_cli.cli", "prepare", str(pictures), "--out", str(out)]
+    line = [sys.executable, "-m", "gsdmsr_cli", "prepare", str(pictures), "--out", str(out)]
     with subprocess.Popen(line, stderr=subprocess.PIPE, text=True) as process:
         deadline = time.monotonic() + 120
         while not any("capture.colmap" in line for line in processes_of(stages)):
@@ -188,7 +188,7 @@ def test_a_full_disk_is_told_and_leaves_no_scene(
 ) -> None:
     import resource
 
-    line = [sys.executable, "-m", "gsdmsr_cli.cli", "prepare", str(pictures)]
+    line = [sys.executable, "-m", "gsdmsr_cli", "prepare", str(pictures)]
     ended = subprocess.run(
         [*line, "--out", str(tmp_path / "scene")], capture_output=True, text=True,
         preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit)),

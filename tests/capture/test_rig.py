@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 from test_prepare import prepare
 
 from gsdmsr_cli.capture.rig import common_moments, parse_offsets, shift
-from gsdmsr_cli.errors import DataError, UsageError
 from gsdmsr_cli.formats import read_scene
-from gsdmsr_cli.imaging import read_image
+from gsdmsr_cli.ground.errors import DataError, UsageError
+from gsdmsr_cli.scene.imaging import read_image
 
 CAMERAS, FRAMES, FPS = 5, 12, 10.0
 

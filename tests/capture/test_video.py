@@ -11,8 +11,8 @@ import room
 
 from gsdmsr_cli.capture.frames import read_frames, write_frames
 from gsdmsr_cli.capture.source import find_source
-from gsdmsr_cli.errors import DataError
-from gsdmsr_cli.video import read_video, video_length
+from gsdmsr_cli.ground.errors import DataError
+from gsdmsr_cli.scene.video import read_video, video_length
 
 
 @pytest.fixture(scope="module")

@@ -16,17 +16,19 @@ import pytest
 import torch
 from datasets import noise, write_picture
 
-from gsdmsr_cli import cli, files, imaging
-from gsdmsr_cli import run as runs
+from gsdmsr_cli.cli.main import main
 from gsdmsr_cli.commands import train as train_command
 from gsdmsr_cli.commands._trained import open_trained
-from gsdmsr_cli.errors import DataError, UsageError
+from gsdmsr_cli.drawing.splatting import draw
 from gsdmsr_cli.formats import read_scene
-from gsdmsr_cli.pictures import Pictures
-from gsdmsr_cli.preset import load_preset
+from gsdmsr_cli.ground import files
+from gsdmsr_cli.ground.errors import DataError, UsageError
+from gsdmsr_cli.options.preset import load_preset
 from gsdmsr_cli.raster import best_engine
-from gsdmsr_cli.run import Run, continue_run, create_run, open_run, refuse_used
-from gsdmsr_cli.splatting import draw
+from gsdmsr_cli.runs import run as runs
+from gsdmsr_cli.runs.run import Run, continue_run, create_run, open_run, refuse_used
+from gsdmsr_cli.scene import imaging
+from gsdmsr_cli.scene.pictures import Pictures
 from gsdmsr_cli.training.trainer import Trainer
 
 Gsdmsr = Callable[..., int]
@@ -39,7 +41,7 @@ def gsdmsr(monkeypatch: pytest.MonkeyPatch) -> Gsdmsr:
     def call(*arguments: object) -> int:
         monkeypatch.setattr(sys, "argv", ["gsdmsr", *map(str, arguments)])
         with pytest.raises(SystemExit) as ended:
-            cli.main()
+            main()
         assert isinstance(ended.value.code, int)
         return ended.value.code
 
@@ -71,6 +73,18 @@ USAGE = {
         "--set motion.widht=3",
         r"--set motion\.widht=3.*did you mean 'width'\?",
     ),
+    "unknown event": ("--set events=[densty]", "unknown event 'densty'; did you mean 'density'"),
+    "an event twice": ("--set events=[density,density]", "events names 'density' twice; drop one"),
+    "unknown option of an event": (
+        '--set events=[{"name":"density","evry":3}]',
+        "unknown key 'evry'",
+    ),
+    "an event that is no name": ("--set events=[3]", "events.*allowed: "),
+    "unknown term of the loss": (
+        '--set losses.terms=[{"name":"flow"}]',
+        "unknown term of the loss 'flow'; known: none",
+    ),
+    "unknown layer": ('--set layers=[{"name":"fade"}]', "unknown layer 'fade'; known: none"),
     "no value": ("--set training.steps", "a.b=value"),
     "no mapping": ("--set training=3 --steps 4", "training is 3; allowed: a mapping"),
     "bad budget": ("--budget 8x", "allowed: null or a positive duration"),
@@ -91,6 +105,27 @@ def test_options_that_do_not_exist_are_refused(
     out = tmp_path / "run"
     assert gsdmsr("train", "--data", tiny_scene, "--out", out, *options.split()) == 2
     assert re.search(message, one_line(capsys))
+    assert not out.exists()
+
+
+SIZES = {
+    "training.views_per_step=17": "training.views_per_step is 17; allowed: 1 to 16",
+    "motion={name: hexplane, levels: [2, 2, 2, 2, 2, 2, 2, 2, 2]}": (
+        "levels is [2, 2, 2, 2, 2, 2, 2, 2, 2]; allowed: 1 to 8 whole numbers, each 2 or more"
+    ),
+    "motion={name: multiscale, channels: 24}": (
+        "channels is 24; allowed: a multiple of 16, 16 or more"
+    ),
+}
+
+
+@pytest.mark.parametrize(("option", "message"), SIZES.items(), ids=SIZES)
+def test_sizes_that_no_kernel_serves_are_refused_before_the_data_is_looked_for(
+    gsdmsr: Gsdmsr, tmp_path: Path, capsys: Any, option: str, message: str
+) -> None:
+    nowhere, out = tmp_path / "nowhere", tmp_path / "run"
+    assert gsdmsr("train", "--data", nowhere, "--out", out, "--set", option) == 2
+    assert one_line(capsys).endswith(f": {message}\n")
     assert not out.exists()
 
 
@@ -118,11 +153,11 @@ def test_a_run_of_half_precision_is_drawn_on_the_cpu_but_not_trained_there(
     assert gsdmsr("train", "--data", tiny_scene, "--out", made.root, "--resume") == 2
     assert "training.precision is bf16; allowed on the CPU: float32" in one_line(capsys)
     assert {path: path.read_bytes() for path in made.root.iterdir()} == before
-    studio = open_trained(made.root, None).studio
+    renderer = open_trained(made.root, None).renderer
     trainer.restore(made.load())
-    assert studio.model.precision == trainer.model.precision == "bf16"
+    assert renderer.model.precision == trainer.model.precision == "bf16"
     view = scene.split("test")[0]
-    frame = draw(studio.model, view.camera, view.time, studio.engine, studio.background)
+    frame = draw(renderer.model, view.camera, view.time, renderer.engine, renderer.background)
     assert frame.rgb.isfinite().all()
 
 
@@ -367,10 +402,10 @@ def test_ctrl_c_ends_an_import_at_once_and_everything_else_in_order(
         "import os, signal\ntry:\n os.kill(os.getpid(), signal.SIGINT)\nfinally:\n print('no')"
     )
     program = (
-        "import os, signal\nfrom gsdmsr_cli import cli\n"
+        "import os, signal\nfrom gsdmsr_cli.cli.main import ctrl_c_that_spares_imports\n"
         # a process in the background of a shell script begins with SIGINT ignored
         "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
-        f"with cli._ctrl_c_that_spares_imports():\n  try:\n    {statement}\n"
+        f"with ctrl_c_that_spares_imports():\n  try:\n    {statement}\n"
         "  except KeyboardInterrupt:\n    print('in order')\n"
         "assert signal.getsignal(signal.SIGINT) is signal.default_int_handler\n"
         "assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL"

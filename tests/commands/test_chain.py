@@ -19,12 +19,13 @@ import numba
 import numpy as np
 import pytest
 import torch
+from motion_checks import splats_at
 
-from gsdmsr_cli import cli
+from gsdmsr_cli.cli.main import main
 from gsdmsr_cli.evaluation import speed
 from gsdmsr_cli.exports._ply import read_ply
-from gsdmsr_cli.imaging import read_image
-from gsdmsr_cli.run import open_run
+from gsdmsr_cli.runs.run import open_run
+from gsdmsr_cli.scene.imaging import read_image
 
 STEPS = 60
 
@@ -56,7 +57,7 @@ def gsdmsr_in_this_process(*arguments: object) -> int:
         patch.setattr(speed, "SECONDS", 0.05)
         patch.setenv("GSDMSR_DEBUG", "1")  # a traceback tells more, should something fail
         with pytest.raises(SystemExit) as ended:
-            cli.main()
+            main()
     assert isinstance(ended.value.code, int)
     return ended.value.code
 
@@ -154,6 +155,10 @@ def test_a_resumed_training_may_only_become_longer(gsdmsr: Gsdmsr, run: Path, da
     ended = gsdmsr(*line, "--set", "splats.count=500")
     assert ended.code == 2
     assert "splats.count = 400, not 500" in ended.err
+    ended = gsdmsr(*line, "--set", "events=[density]")
+    assert ended.code == 2
+    listed = '"density", "opacity_reset", "thinning", "stillness"'
+    assert f'was trained with events = [{listed}], not ["density"]; --resume' in ended.err
 
 
 def test_overwriting_starts_anew(gsdmsr: Gsdmsr, copied: Path, data: Path) -> None:
@@ -329,13 +334,29 @@ def test_exported_splats_are_moved_ones(gsdmsr: Gsdmsr, run: Path, tmp_path: Pat
         path = tmp_path / f"{moment}.ply"
         ended = gsdmsr("export", run, "--format", "ply", "--time", moment, "--out", path)
         assert ended.code == 0 and "wrote" in ended.out
-        found, expected = read_ply(path).tensors(), model.at(moment).tensors()
+        found, expected = read_ply(path).tensors(), splats_at(model, moment).tensors()
         for name, tensor in expected.items():
             if name != "quats":  # stored at unit length
                 assert torch.equal(found[name], tensor), name
     first, last = (read_ply(tmp_path / f"{moment}.ply") for moment in (0.0, 1.0))
     assert (first.means - last.means).norm(dim=1).max() > 1e-3
     assert not torch.equal(first.quats, last.quats)
+
+
+def test_an_option_of_an_export_may_be_given_by_its_name(
+    gsdmsr: Gsdmsr, run: Path, tmp_path: Path
+) -> None:
+    named, set_ = tmp_path / "named.ply", tmp_path / "set.ply"
+    line = "export", run, "--format", "ply", "--out"
+    assert gsdmsr(*line, named, "--time", 0.4).code == 0
+    assert gsdmsr(*line, set_, "--set", "time=0.4").code == 0
+    assert named.read_bytes() == set_.read_bytes()
+    refused = gsdmsr(*line, tmp_path / "x.ply", "--set", "tiem=0.4")
+    expected = "--set tiem=0.4 is not for --format ply, which takes time; drop it"
+    assert refused.code == 2 and refused.err.endswith(f"error: {expected}\n")
+    refused = gsdmsr(*line, tmp_path / "x.ply", "--set", "time=late")
+    assert refused.code == 2 and 'time is "late"; allowed: a number' in refused.err
+    assert not (tmp_path / "x.ply").exists()
 
 
 def test_a_sequence_of_splats_moves(gsdmsr: Gsdmsr, run: Path, tmp_path: Path) -> None:
@@ -348,12 +369,12 @@ def test_a_sequence_of_splats_moves(gsdmsr: Gsdmsr, run: Path, tmp_path: Path) -
     assert len({len(m) for m in means}) == 1
     assert not torch.equal(means[0], means[1]) and not torch.equal(means[1], means[2])
     model, _ = open_run(run).load_model()
-    assert torch.equal(means[1], model.at(0.5).means)
+    assert torch.equal(means[1], splats_at(model, 0.5).means)
 
 
 def test_stdout_of_a_process_holds_one_json_object(run: Path) -> None:
     """As a pipe sees it, with libraries and exit hooks."""
-    line = [sys.executable, "-m", "gsdmsr_cli.cli", "eval", str(run), "--json"]
+    line = [sys.executable, "-m", "gsdmsr_cli", "eval", str(run), "--json"]
     done = subprocess.run(line, capture_output=True, text=True, timeout=300, check=False)
     assert (done.returncode, done.stderr) == (0, "")
     assert document_of(Ended(0, done.stdout, ""))["protocol"]["split"] == "test"
@@ -363,7 +384,7 @@ def test_ctrl_c_leaves_a_run_to_go_on_with(data: Path, tmp_path: Path, gsdmsr: G
     out = tmp_path / "run"
     arguments = ["train", "--data", str(data), "--out", str(out), *OPTIONS, "--steps=1000000"]
     process = subprocess.Popen(
-        [sys.executable, "-m", "gsdmsr_cli.cli", *arguments],
+        [sys.executable, "-m", "gsdmsr_cli", *arguments],
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=os.environ,
     )  # fmt: skip
     deadline = time.monotonic() + 300

@@ -8,10 +8,10 @@ from typing import Any
 import pytest
 
 from gsdmsr_cli.commands import demo
-from gsdmsr_cli.errors import UsageError
+from gsdmsr_cli.demo.synthetic import write_scene
 from gsdmsr_cli.formats import dnerf
-from gsdmsr_cli.preset import load_preset, parse_duration
-from gsdmsr_cli.synthetic import write_scene
+from gsdmsr_cli.ground.errors import UsageError
+from gsdmsr_cli.options.preset import load_preset, parse_duration
 
 Calls = list[tuple[str, tuple[Any, ...]]]
 

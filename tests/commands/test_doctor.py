@@ -11,8 +11,8 @@ import pytest
 import torch
 
 from gsdmsr_cli import raster
+from gsdmsr_cli.backends.cuda import availability
 from gsdmsr_cli.commands import doctor
-from gsdmsr_cli.cuda import availability
 
 
 @pytest.fixture(autouse=True)

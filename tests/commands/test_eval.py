@@ -19,16 +19,17 @@ from datasets import write_picture
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 from torchmetrics.functional.image import multiscale_structural_similarity_index_measure
 
-from gsdmsr_cli import cli
+from gsdmsr_cli.cli.main import main
 from gsdmsr_cli.commands import _trained
 from gsdmsr_cli.commands import eval as evaluation
+from gsdmsr_cli.demo.synthetic import write_scene
 from gsdmsr_cli.evaluation import speed
 from gsdmsr_cli.evaluation.lpips import Lpips, load_lpips
 from gsdmsr_cli.formats import read_scene
-from gsdmsr_cli.imaging import read_image
 from gsdmsr_cli.reporting.markup import at
-from gsdmsr_cli.scene import Scene
-from gsdmsr_cli.synthetic import write_scene
+from gsdmsr_cli.scene.imaging import read_image
+from gsdmsr_cli.scene.scene import Scene
+from gsdmsr_cli.training.timings import TIMINGS
 
 SIDE = 176
 """Of the pictures: the least for MS-SSIM."""
@@ -43,7 +44,7 @@ def gsdmsr(*arguments: object) -> int:
         patch.setattr(sys, "argv", ["gsdmsr", *map(str, arguments)])
         patch.setattr(speed, "SECONDS", 0.05)
         with pytest.raises(SystemExit) as ended:
-            cli.main()
+            main()
     assert isinstance(ended.value.code, int)
     return ended.value.code
 
@@ -150,20 +151,20 @@ def test_the_other_background_is_scored_as_if_it_were_asked_for(evaluate: Eval) 
     assert (white["aggregate"], white["frames"]) == (both["aggregate"], both["frames"])
 
 
-def test_the_time_of_training_is_that_of_its_stages(evaluate: Eval) -> None:
+def test_the_time_of_training_is_that_of_its_timings(evaluate: Eval) -> None:
     training = evaluate()["training"]
-    stages = training["stages_s"]
-    assert set(stages) == {"look", "learn", "grow", "watch", "save", "other"}
-    assert sum(stages.values()) == pytest.approx(training["train_s"], abs=0.02)
-    assert stages["look"] > stages["learn"] > 0
+    seconds = training["stages_s"]
+    assert set(seconds) == {*TIMINGS, "other"}
+    assert sum(seconds.values()) == pytest.approx(training["train_s"], abs=0.02)
+    assert seconds["gradients"] > seconds["optimizer"] > 0
 
 
-def test_a_run_whose_log_knows_no_stages_has_none(run: Path, evaluate: Eval) -> None:
+def test_a_run_whose_log_has_no_timings_has_none(run: Path, evaluate: Eval) -> None:
     log = run / "metrics.jsonl"
     before = log.read_text()
     entries = [json.loads(line) for line in before.splitlines()]
     try:
-        log.write_text("".join(f"{json.dumps(e | {'stages': {}})}\n" for e in entries))
+        log.write_text("".join(f"{json.dumps(e | {'timings': {}})}\n" for e in entries))
         assert evaluate()["training"]["stages_s"] == {}
     finally:
         log.write_text(before)
@@ -258,8 +259,10 @@ def test_parts_that_masks_choose_are_scored_where_they_are(
         views = [
             replace(
                 view,
-                mask_path=tmp_path / "counts.png",
-                moving_path=tmp_path / ("still.png" if view.name == "r_000" else "moves.png"),
+                signals={
+                    "mask": tmp_path / "counts.png",
+                    "moving": tmp_path / ("still.png" if view.name == "r_000" else "moves.png"),
+                },
             )
             for view in scene.views
         ]

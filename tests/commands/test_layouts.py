@@ -16,11 +16,11 @@ import pytest
 import torch
 from datasets import write_json, write_picture
 
-from gsdmsr_cli import cli
+from gsdmsr_cli.cli.main import main
 from gsdmsr_cli.evaluation import speed
 from gsdmsr_cli.formats import read_scene
-from gsdmsr_cli.imaging import composite, read_image
-from gsdmsr_cli.scene import Scene, View
+from gsdmsr_cli.scene.imaging import composite, read_image
+from gsdmsr_cli.scene.scene import Scene, View
 
 STEPS = 80
 
@@ -151,7 +151,7 @@ def gsdmsr(*arguments: object) -> None:
         patch.setattr(sys, "argv", ["gsdmsr", *map(str, arguments)])
         patch.setenv("GSDMSR_DEBUG", "1")
         with pytest.raises(SystemExit) as ended:
-            cli.main()
+            main()
     assert ended.value.code == 0
 
 

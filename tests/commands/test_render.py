@@ -17,16 +17,16 @@ import numpy as np
 import pytest
 import torch
 
-from gsdmsr_cli import cli
-from gsdmsr_cli.filming import layers as drawn_layers
-from gsdmsr_cli.filming import shoot
+from gsdmsr_cli.cli.main import main
+from gsdmsr_cli.filming import buffers as drawn_buffers
+from gsdmsr_cli.filming import draw_film
 from gsdmsr_cli.formats import read_scene
-from gsdmsr_cli.imaging import image_size, read_exr, read_image
-from gsdmsr_cli.native import load_av
-from gsdmsr_cli.pictures import Pictures
-from gsdmsr_cli.preset import load_preset
+from gsdmsr_cli.options.preset import load_preset
 from gsdmsr_cli.raster import best_engine
-from gsdmsr_cli.run import create_run
+from gsdmsr_cli.runs.run import create_run
+from gsdmsr_cli.scene.imaging import image_size, read_exr, read_image
+from gsdmsr_cli.scene.native import load_av
+from gsdmsr_cli.scene.pictures import Pictures
 from gsdmsr_cli.training.trainer import Trainer
 
 Render = Callable[..., int]
@@ -54,7 +54,7 @@ def render(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Render
             words += ["--out", tmp_path / "out"]
         monkeypatch.setattr(sys, "argv", [str(word) for word in words])
         with pytest.raises(SystemExit) as ended:
-            cli.main()
+            main()
         assert isinstance(ended.value.code, int)
         return ended.value.code
 
@@ -109,7 +109,7 @@ def test_a_broken_film_is_gone_on_with(
     )
     assert render(line, "--out", whole) == 0
 
-    draw, drawn = drawn_layers.Artist.draw, []
+    draw, drawn = drawn_buffers.BufferRenderer.draw, []
 
     def fail_at_sixth(self: Any, shot: Any, following: Any) -> Any:
         drawn.append(shot)
@@ -120,9 +120,11 @@ def test_a_broken_film_is_gone_on_with(
 
     capsys.readouterr()
     with monkeypatch.context() as patch:
-        patch.setattr(shoot.Artist, "draw", fail_at_sixth)
+        patch.setattr(draw_film.BufferRenderer, "draw", fail_at_sixth)
         # which draws as well
-        patch.setattr("gsdmsr_cli.commands.render.find_ends", lambda *_: ends_of(whole))
+        patch.setattr(
+            "gsdmsr_cli.commands.render.find_colour_range", lambda *_: colour_range_of(whole)
+        )
         assert render(line, "--out", broken) == 130
     there = {name: stamps(broken / name) for name in ("orbit", "orbit-depth")}
     assert len(there["orbit"]) == 5 and not list(tmp_path.rglob("*.part*"))
@@ -145,11 +147,11 @@ def test_a_broken_film_is_gone_on_with(
     assert "nothing to draw, 8 were there already" in capsys.readouterr().out
 
 
-def ends_of(folder: Path) -> Any:
-    from gsdmsr_cli.filming.outputs import Ends
+def colour_range_of(folder: Path) -> Any:
+    from gsdmsr_cli.filming.outputs import ColourRange
 
     note = json.loads((folder / "orbit-depth.film.json").read_text())
-    return Ends(note["near"], note["far"])
+    return ColourRange(note["near"], note["far"])
 
 
 @pytest.mark.parametrize(
@@ -207,7 +209,7 @@ def test_ctrl_c_leaves_whole_frames_and_nothing_else(run: Path, tmp_path: Path) 
     # a process in the background of a shell script begins with SIGINT ignored
     program = (
         "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler); "
-        "from gsdmsr_cli.cli import main; main()"
+        "from gsdmsr_cli.cli.main import main; main()"
     )
     process = subprocess.Popen(
         [sys.executable, "-c", program, *map(str, line)],
@@ -311,7 +313,7 @@ def test_a_run_without_a_checkpoint_is_bad_data(
     (bare / "run.json").write_bytes((run / "run.json").read_bytes())
     monkeypatch.setattr(sys, "argv", ["gsdmsr", "render", str(bare)])
     with pytest.raises(SystemExit) as ended:
-        cli.main()
+        main()
     assert ended.value.code == 3
     assert "the run has no checkpoint yet" in one_line(capsys)
 
@@ -320,7 +322,7 @@ def test_a_run_without_a_checkpoint_is_bad_data(
 def test_a_folder_that_cannot_be_written_is_told_before_drawing(
     render: Render, tmp_path: Path, capsys: Any, monkeypatch: Any, place: str
 ) -> None:
-    monkeypatch.setattr("gsdmsr_cli.commands.render.shoot", lambda *_: pytest.fail("it draws"))
+    monkeypatch.setattr("gsdmsr_cli.commands.render.draw_film", lambda *_: pytest.fail("it draws"))
     blocked = tmp_path / place
     blocked.parent.mkdir(exist_ok=True)
     blocked.write_text('{"tour": "of somebody else"}')
@@ -350,7 +352,7 @@ def test_the_runs_own_folder_is_cleared(run: Path, monkeypatch: Any) -> None:
         sys, "argv", ["gsdmsr", "render", str(run), *["--path", "orbit", "--frames", "2"]]
     )
     with pytest.raises(SystemExit) as ended:
-        cli.main()
+        main()
     assert ended.value.code == 0
     assert sorted(stamps(path.parent)) == ["0000.png", "0001.png"]
 

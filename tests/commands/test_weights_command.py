@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 
 from gsdmsr_cli.commands import weights
-from gsdmsr_cli.errors import DataError, UsageError
 from gsdmsr_cli.evaluation.weights import Fetched, Source
+from gsdmsr_cli.ground.errors import DataError, UsageError
 
 Fetches = list[tuple[str, Path]]
 

@@ -10,9 +10,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gsdmsr_cli.errors import DataError, UsageError
-from gsdmsr_cli.evaluation.gates import SAME, Bound, read_gates
+from gsdmsr_cli.evaluation.gates import SAME, Threshold, read_gates
 from gsdmsr_cli.evaluation.request import Demands
+from gsdmsr_cli.ground.errors import DataError, UsageError
 
 PROTOCOL = {
     "split": "test",
@@ -42,15 +42,15 @@ numbers = st.floats(-1e3, 1e3)
 
 @given(numbers, numbers)
 def test_a_bound_is_the_least_or_the_most_itself_included(value: float, bound: float) -> None:
-    assert Bound("psnr", bound).judge({"psnr": value}).passed == (value >= bound)
-    assert Bound("lpips_alex", bound).judge({"lpips_alex": distance(value)}).passed == (
+    assert Threshold("psnr", bound).judge({"psnr": value}).passed == (value >= bound)
+    assert Threshold("lpips_alex", bound).judge({"lpips_alex": distance(value)}).passed == (
         value <= bound
     )
 
 
 @pytest.mark.parametrize("aggregate", [{}, {"psnr": None}, {"psnr": distance(None)}])
 def test_what_has_no_value_passes_nothing(aggregate: dict[str, Any], tmp_path: Path) -> None:
-    verdict = Bound("psnr", -1e9).judge(aggregate)
+    verdict = Threshold("psnr", -1e9).judge(aggregate)
     assert not verdict.passed and "psnr has no value" in verdict.found
     earlier = written(tmp_path / "a.json", report(psnr=1.0))
     (verdict,) = read_gates(Demands(baseline=earlier)).judge({"aggregate": aggregate})

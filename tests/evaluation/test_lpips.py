@@ -11,10 +11,10 @@ import torch
 import torch.nn.functional as F  # noqa: N812
 from torch import Tensor
 
-from gsdmsr_cli.errors import DataError, UsageError
 from gsdmsr_cli.evaluation.lpips import NETS, Lpips, load_lpips
 from gsdmsr_cli.evaluation.lpips_trunks import ARCHITECTURES
 from gsdmsr_cli.evaluation.metrics import Missing
+from gsdmsr_cli.ground.errors import DataError, UsageError
 
 Weights = dict[str, Tensor]
 

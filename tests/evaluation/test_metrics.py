@@ -14,6 +14,8 @@ from torch import Tensor
 from torchmetrics.functional.image import multiscale_structural_similarity_index_measure
 
 from gsdmsr_cli.evaluation.metrics import MS_SSIM_SMALLEST, ms_ssim, psnr, quantize, ssim
+from gsdmsr_cli.ground import ssim as ssim_constants
+from gsdmsr_cli.ops.photometric import cpu as photometric
 
 
 def pair(height: int, width: int, seed: int = 0) -> tuple[Tensor, Tensor]:
@@ -206,3 +208,9 @@ def test_quantize_lands_on_eight_bit_levels() -> None:
 def test_quantize_moves_by_at_most_half_a_level(value: float) -> None:
     image = torch.tensor(value, dtype=torch.float64)
     assert abs(quantize(image) - image).item() <= 0.5 / 255 + 1e-12
+
+
+def test_the_window_is_the_gaussian_of_the_loss() -> None:
+    weights = [math.exp(-(k**2) / (2 * 1.5**2)) for k in range(-5, 6)]
+    np.testing.assert_allclose(ssim_constants.WINDOW, np.divide(weights, sum(weights)), rtol=1e-14)
+    assert np.array_equal(ssim_constants.WINDOW.astype(np.float32), photometric.WINDOW)

@@ -11,26 +11,24 @@ import numpy as np
 import pytest
 import torch
 from datasets import noise, write_picture
+from motion_checks import model_of, started
 from torch import Tensor
 
-from gsdmsr_cli.camera import Camera
-from gsdmsr_cli.errors import DataError
 from gsdmsr_cli.evaluation import protocol
 from gsdmsr_cli.evaluation.metrics import Missing, psnr, quantize, ssim
 from gsdmsr_cli.evaluation.protocol import (
-    Studio,
+    ViewRenderer,
     average,
     score,
     score_views,
     storage,
 )
-from gsdmsr_cli.fields.planes import CUBE
-from gsdmsr_cli.model import Model
-from gsdmsr_cli.motion import Facts, start_motion
-from gsdmsr_cli.pictures import Pictures
+from gsdmsr_cli.gaussians.splats import Splats
+from gsdmsr_cli.ground.errors import DataError
 from gsdmsr_cli.raster import load_engine
-from gsdmsr_cli.scene import View
-from gsdmsr_cli.splats import Splats
+from gsdmsr_cli.scene.camera import Camera
+from gsdmsr_cli.scene.pictures import Pictures
+from gsdmsr_cli.scene.scene import View
 
 BACKGROUND = (0.2, 0.4, 0.6)
 
@@ -121,7 +119,7 @@ def test_every_missing_value_has_its_reason() -> None:
 
 
 @pytest.fixture
-def studio() -> Studio:
+def renderer() -> ViewRenderer:
     """One grey splat that covers the picture, and its background."""
     splats = Splats(
         means=torch.zeros(1, 3),
@@ -130,10 +128,9 @@ def studio() -> Studio:
         logit_opacities=torch.zeros(1),
         sh=torch.zeros(1, 1, 3),
     )
-    motion = start_motion({"name": "static"}, Facts(1.0, CUBE, 2), 1, torch.Generator())
     pictures = Pictures(BACKGROUND, 2, 10**6)
     engine, background = load_engine("reference"), torch.tensor(BACKGROUND)
-    return Studio(Model(splats, motion), engine, pictures, background)
+    return ViewRenderer(model_of(splats, started("static")), engine, pictures, background)
 
 
 def view_of(path: Path, name: str) -> View:
@@ -144,11 +141,11 @@ def view_of(path: Path, name: str) -> View:
 
 
 def test_a_studio_draws_and_loads_at_the_size_of_its_pictures(
-    studio: Studio, tmp_path: Path
+    renderer: ViewRenderer, tmp_path: Path
 ) -> None:
     write_picture(tmp_path / "a.png", np.full((16, 20, 3), 51, np.uint8))
     view = view_of(tmp_path, "a")
-    drawn, true = studio.draw(view), studio.true(view)
+    drawn, true = renderer.draw(view), renderer.true(view)
     assert drawn.shape == true.shape == (8, 10, 3)
     assert not drawn.requires_grad
     torch.testing.assert_close(true, torch.full((8, 10, 3), 0.2))
@@ -163,48 +160,49 @@ def write_mask(path: Path, white: tuple[slice, slice]) -> Path:
     return path
 
 
-def test_what_moves_is_a_part_of_what_counts(studio: Studio, tmp_path: Path) -> None:
+def test_what_moves_is_a_part_of_what_counts(renderer: ViewRenderer, tmp_path: Path) -> None:
     view = view_of(tmp_path, "a")
-    assert studio.parts(view) == {}
+    assert renderer.parts(view) == {}
     left, above = (slice(None), slice(0, 10)), (slice(0, 4), slice(None))
-    view = replace(view, moving_path=write_mask(tmp_path / "moves.png", left))
+    view = replace(view, signals={"moving": write_mask(tmp_path / "moves.png", left)})
     rows, columns = torch.meshgrid(torch.arange(8), torch.arange(10), indexing="ij")
-    parts = studio.parts(view)
+    parts = renderer.parts(view)
     assert parts.keys() == {"moving", "static"}
     assert torch.equal(parts["moving"], columns < 5)
     assert torch.equal(parts["static"], columns >= 5)
-    parts = studio.parts(replace(view, mask_path=write_mask(tmp_path / "counts.png", above)))
+    mask = write_mask(tmp_path / "counts.png", above)
+    parts = renderer.parts(replace(view, signals={**view.signals, "mask": mask}))
     assert torch.equal(parts["masked"], rows < 2)
     assert torch.equal(parts["moving"], (rows < 2) & (columns < 5))
     assert torch.equal(parts["static"], (rows < 2) & (columns >= 5))
 
 
 def test_another_background_lies_behind_drawn_and_true_pictures(
-    studio: Studio, tmp_path: Path
+    renderer: ViewRenderer, tmp_path: Path
 ) -> None:
     write_picture(tmp_path / "a.png", np.full((16, 20, 4), (255, 255, 255, 51), np.uint8))
-    view, black = view_of(tmp_path, "a"), studio.over((0.0, 0.0, 0.0))
+    view, black = view_of(tmp_path, "a"), renderer.over((0.0, 0.0, 0.0))
     drawn = torch.full((8, 10, 3), 0.25)
     torch.testing.assert_close(black.draw(view), drawn, atol=5e-3, rtol=0)
     torch.testing.assert_close(black.true(view), torch.full((8, 10, 3), 0.2))
-    assert studio.true(view)[0, 0, 2] == pytest.approx(0.2 + 0.8 * 0.6, abs=0.5 / 255)
+    assert renderer.true(view)[0, 0, 2] == pytest.approx(0.2 + 0.8 * 0.6, abs=0.5 / 255)
 
 
-def test_views_are_scored_in_order_and_told(studio: Studio, tmp_path: Path) -> None:
+def test_views_are_scored_in_order_and_told(renderer: ViewRenderer, tmp_path: Path) -> None:
     views = [view_of(tmp_path, name) for name in "ab"]
     for view, level in zip(views, (77, 200), strict=True):
         write_picture(view.image_path, np.full((16, 20, 3), level, np.uint8))
     told: list[int] = []
-    scored = score_views(studio, views, {}, told.append)
+    scored = score_views(renderer, views, {}, told.append)
     assert [view for view, _ in scored] == views and told == [1, 2]
     for view, scores in scored:
-        assert scores == score(studio.draw(view), studio.true(view), {})
+        assert scores == score(renderer.draw(view), renderer.true(view), {})
     assert scored[0][1]["psnr"] != scored[1][1]["psnr"]
 
 
-def test_a_missing_picture_is_told(studio: Studio, tmp_path: Path) -> None:
+def test_a_missing_picture_is_told(renderer: ViewRenderer, tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"b\.png"):
-        score_views(studio, [view_of(tmp_path, "b")], {}, lambda done: None)
+        score_views(renderer, [view_of(tmp_path, "b")], {}, lambda done: None)
 
 
 def test_storage_counts_the_bytes_of_each_part() -> None:

@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 import torch
 
-from gsdmsr_cli.camera import Camera
 from gsdmsr_cli.evaluation import speed
 from gsdmsr_cli.evaluation.speed import SECONDS, SHOTS, WARM_UP, measure_speed
+from gsdmsr_cli.model.layer import Instant
+from gsdmsr_cli.scene.camera import Camera
 
 DRAW_S, MOVE_S = 0.02, 0.03
 
@@ -27,15 +28,25 @@ class Stage:
     def perf_counter(self) -> float:
         return self.now
 
-    def at(self, moment: float) -> float:
+    def instant(self, time: float, camera: Camera) -> Instant:
+        return Instant(time, camera)
+
+    def at(self, instant: Instant) -> Any:
         assert not torch.is_grad_enabled()
         self.now += MOVE_S
-        self.moments.append(moment)
-        return moment
+        self.moments.append(instant.time)
+        return SimpleNamespace(splats=instant.time)
 
-    def rasterize(self, splats: float, camera: Camera, background: Any) -> None:
+    def rasterize(self, moment: Any, camera: Camera, background: Any, *rest: Any) -> str:
         self.now += DRAW_S
-        self.drawn.append((splats, camera))
+        self.drawn.append((moment.splats, camera))
+        return f"frame {len(self.drawn)}"
+
+    def shade(self, frame: str, instant: Instant) -> str:
+        """Be asked of every frame right after it has been drawn, at its own instant."""
+        assert frame == f"frame {len(self.drawn)}"
+        assert (instant.time, instant.camera) == self.drawn[-1]
+        return frame
 
 
 def measured(stage: Stage, shots: list[tuple[Camera, float]]) -> speed.Speed:

@@ -10,10 +10,10 @@ from pathlib import Path
 
 import pytest
 
-from gsdmsr_cli.errors import DataError
 from gsdmsr_cli.evaluation import weights
 from gsdmsr_cli.evaluation.lpips import NETS
 from gsdmsr_cli.evaluation.weights import Source, fetch, source
+from gsdmsr_cli.ground.errors import DataError
 
 CONTENT = bytes(range(256)) * 9000
 

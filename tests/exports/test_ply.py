@@ -3,24 +3,31 @@
 from __future__ import annotations
 
 import errno
+import re
 import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
+from motion_checks import model_of, splats_at
+from torch import Tensor
 
-from gsdmsr_cli import plugins
-from gsdmsr_cli.errors import DataError, UsageError
-from gsdmsr_cli.exports import ExportOptions
-from gsdmsr_cli.exports import ply as ply_format
-from gsdmsr_cli.exports import ply_sequence as sequence_format
+from gsdmsr_cli.exports import Facts, export
 from gsdmsr_cli.exports._ply import read_ply, write_ply
-from gsdmsr_cli.splats import Splats
+from gsdmsr_cli.gaussians.moment import Moment
+from gsdmsr_cli.gaussians.splats import Splats
+from gsdmsr_cli.ground import plugins
+from gsdmsr_cli.ground.errors import DataError, UsageError
+from gsdmsr_cli.model.layer import Instant, Layer
+from gsdmsr_cli.model.model import Model
+from gsdmsr_cli.options.strict import Located
 
 
 def make_splats(n: int, degree: int, seed: int = 0) -> Splats:
@@ -31,14 +38,23 @@ def make_splats(n: int, degree: int, seed: int = 0) -> Splats:
     return Splats(**{k: 3 * torch.randn((n, *s), generator=generator) for k, s in shapes.items()})
 
 
-class Falling:
-    """Splats that fall by one unit."""
+FACTS: Facts = SimpleNamespace(bound=1.0, frames=3)
 
-    def __init__(self, splats: Splats) -> None:
-        self.splats = splats
 
-    def at(self, time: float) -> Splats:
-        return replace(self.splats, means=self.splats.means + torch.tensor([0.0, time, 0.0]))
+class Falling(Layer):
+    """Splats that fall by one unit; their moments have the axes and features that are given."""
+
+    def __init__(self, **beside: Tensor) -> None:
+        super().__init__()
+        self.beside = beside
+
+    def at(self, moment: Moment, instant: Instant) -> Moment:
+        way = torch.tensor([0.0, instant.time, 0.0])
+        return Moment(replace(moment.splats, means=moment.splats.means + way), **self.beside)
+
+
+def falling(splats: Splats, **beside: Tensor) -> Model:
+    return model_of(splats, Falling(**beside))
 
 
 def parse(path: Path) -> tuple[list[str], np.ndarray]:
@@ -214,57 +230,89 @@ def test_a_missing_file_is_bad_data(tmp_path: Path) -> None:
         read_ply(tmp_path / "absent.ply")
 
 
+def write(kind: str, model: Any, out: Path, *counted: Any, **settings: Any) -> list[Path]:
+    """Export with the options that are given; ``counted`` may be a list that gets the progress."""
+    told = counted[0] if counted else []
+    return export(kind, model, FACTS, Located(settings), out, lambda *n: told.append(n))
+
+
 def test_ply_shows_the_moment_that_is_asked_for(tmp_path: Path) -> None:
-    model, told = Falling(make_splats(3, 1)), []
-    options = ExportOptions(time=0.25, progress=lambda *counts: told.append(counts))
+    model, told = falling(make_splats(3, 1)), []
     target = tmp_path / "made" / "moment.ply"
-    assert ply_format.export(model, target, options) == [target]
-    assert torch.equal(read_ply(target).means, model.at(0.25).means)
+    assert write("ply", model, target, told, time=0.25) == [target]
+    assert torch.equal(read_ply(target).means, splats_at(model, 0.25).means)
     assert told == [(1, 1)]
     with pytest.raises(UsageError, match=r"does not end in \.ply"):
-        ply_format.export(model, tmp_path / "moment.obj", options)
+        write("ply", model, tmp_path / "moment.obj", time=0.25)
 
 
 def test_sequence_spreads_its_frames_over_time(tmp_path: Path) -> None:
-    model, told = Falling(make_splats(3, 0)), []
-    options = ExportOptions(frames=5, progress=lambda *counts: told.append(counts))
-    paths = sequence_format.export(model, tmp_path / "run", options)
+    model, told = falling(make_splats(3, 0)), []
+    paths = write("ply-sequence", model, tmp_path / "run", told, frames=5)
     assert [path.name for path in paths] == [f"frame000{i}.ply" for i in range(1, 6)]
     assert sorted((tmp_path / "run").iterdir()) == paths
     for path, time in zip(paths, (0.0, 0.25, 0.5, 0.75, 1.0), strict=True):
-        assert torch.equal(read_ply(path).means, model.at(time).means)
+        assert torch.equal(read_ply(path).means, splats_at(model, time).means)
     assert told == [(i, 5) for i in range(1, 6)]
 
 
-def test_sequence_takes_given_times_and_a_single_frame(tmp_path: Path) -> None:
-    model = Falling(make_splats(2, 0))
-    paths = sequence_format.export(model, tmp_path / "a", ExportOptions(times=(0.1, 0.9)))
-    assert torch.equal(read_ply(paths[1]).means, model.at(0.9).means)
-    (path,) = sequence_format.export(model, tmp_path / "b", ExportOptions(frames=1))
-    assert torch.equal(read_ply(path).means, model.at(0.0).means)
+def test_sequence_takes_a_given_time_and_a_single_frame(tmp_path: Path) -> None:
+    model = falling(make_splats(2, 0))
+    (path,) = write("ply-sequence", model, tmp_path / "a", time=0.9)
+    assert torch.equal(read_ply(path).means, splats_at(model, 0.9).means)
+    (path,) = write("ply-sequence", model, tmp_path / "b", frames=1)
+    assert torch.equal(read_ply(path).means, splats_at(model, 0.0).means)
 
 
 def test_sequence_refuses_to_mix_with_a_longer_one(tmp_path: Path) -> None:
-    model = Falling(make_splats(2, 0))
-    sequence_format.export(model, tmp_path, ExportOptions(frames=4))
-    sequence_format.export(model, tmp_path, ExportOptions(frames=4))
+    model = falling(make_splats(2, 0))
+    write("ply-sequence", model, tmp_path, frames=4)
+    write("ply-sequence", model, tmp_path, frames=4)
     with pytest.raises(DataError, match=r"2 frames of another sequence, frame0003\.ply"):
-        sequence_format.export(model, tmp_path, ExportOptions(frames=2))
+        write("ply-sequence", model, tmp_path, frames=2)
 
 
 def test_sequence_refuses_a_file_and_no_frames(tmp_path: Path) -> None:
-    model = Falling(make_splats(2, 0))
+    model = falling(make_splats(2, 0))
     (tmp_path / "file").touch()
     with pytest.raises(DataError, match="must name a folder"):
-        sequence_format.export(model, tmp_path / "file", ExportOptions(frames=2))
+        write("ply-sequence", model, tmp_path / "file", frames=2)
     with pytest.raises(UsageError, match="--frames"):
-        sequence_format.export(model, tmp_path / "run", ExportOptions())
+        write("ply-sequence", model, tmp_path / "run")
 
 
-@pytest.mark.parametrize("options", [{"time": 1.5}, {"times": (0.0, float("nan"))}, {"frames": -1}])
-def test_impossible_options_are_refused(options: dict[str, object]) -> None:
-    with pytest.raises(UsageError):
-        ExportOptions(**options)
+@pytest.mark.parametrize(
+    ("kind", "options", "message"),
+    [
+        ("ply", {"time": 1.5}, "time is 1.5; allowed: 0 to 1"),
+        ("ply", {"time": float("nan")}, "time is NaN; allowed"),
+        ("ply", {"frames": 3}, "frames is not for --format ply, which takes time; drop it"),
+        ("ply-sequence", {"time": -0.1}, "time is -0.1; allowed: 0 to 1"),
+        ("ply-sequence", {"frames": -1}, "frames is -1; allowed: 1 or more"),
+        ("ply-sequence", {"frames": 2, "time": 0.5}, "--time and --frames are both given"),
+        ("plys", {}, "unknown exports 'plys'; did you mean 'ply'?"),
+    ],
+)
+def test_impossible_options_are_refused(
+    tmp_path: Path, kind: str, options: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(UsageError, match=re.escape(message)) as caught:
+        write(kind, falling(make_splats(2, 0)), tmp_path / "a.ply", **options)
+    assert "\n" not in str(caught.value)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("kind", ["ply", "ply-sequence"])
+def test_what_a_ply_cannot_carry_is_refused(tmp_path: Path, kind: str) -> None:
+    splats, options = make_splats(2, 0), {"time": 0.5}
+    axes, features = torch.eye(3).expand(2, 3, 3), torch.zeros(2, 4)
+    with pytest.raises(UsageError, match=f"--format {kind} cannot carry axes .* nor features"):
+        write(kind, falling(splats, axes=axes, features=features), tmp_path / "a.ply", **options)
+    with pytest.raises(UsageError, match="cannot carry features beside the colours of this run"):
+        write(kind, falling(splats, features=features), tmp_path / "a.ply", **options)
+    assert list(tmp_path.iterdir()) == []
+    (path,) = write(kind, falling(splats), tmp_path / "a.ply", **options)
+    assert torch.equal(read_ply(path).means, splats_at(falling(splats), 0.5).means)
 
 
 def test_formats_are_found_without_loading_torch() -> None:

@@ -10,10 +10,10 @@ import cv2
 import numpy as np
 import pytest
 
-from gsdmsr_cli.errors import GsdmsrError, UsageError
 from gsdmsr_cli.filming.encode import ENCODINGS, require_encoder, write_video
 from gsdmsr_cli.filming.request import VIDEOS
-from gsdmsr_cli.native import load_av
+from gsdmsr_cli.ground.errors import GsdmsrError, UsageError
+from gsdmsr_cli.scene.native import load_av
 
 COLOURS = [(220, 30, 30), (30, 200, 30), (40, 40, 210), (250, 250, 250)]
 BOTH = pytest.mark.parametrize("kind", ENCODINGS)
@@ -127,7 +127,7 @@ def test_a_video_that_does_not_fit_on_the_disk_is_refused(tmp_path: Path, kind: 
 import resource, signal
 from pathlib import Path
 import numpy as np
-from gsdmsr_cli.errors import DataError
+from gsdmsr_cli.ground.errors import DataError
 from gsdmsr_cli.filming.encode import write_video
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 resource.setrlimit(resource.RLIMIT_FSIZE, (20000, 20000))

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from gsdmsr_cli.errors import DataError
 from gsdmsr_cli.formats import read_scene
+from gsdmsr_cli.ground.errors import DataError
 
 
 def assert_refused(folder: Path, message: str) -> None:

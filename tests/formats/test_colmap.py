@@ -12,10 +12,10 @@ import pytest
 from datasets import noise, write_json, write_picture
 from refusals import assert_refused
 
-from gsdmsr_cli import imaging  # noqa: F401  (before pycolmap, see there)
-from gsdmsr_cli.errors import DataError
 from gsdmsr_cli.formats import read_scene
 from gsdmsr_cli.formats.colmap import times_by_name
+from gsdmsr_cli.ground.errors import DataError
+from gsdmsr_cli.scene import imaging  # noqa: F401  (before pycolmap, see there)
 
 MODELS: dict[str, tuple[int, list[float]]] = {
     "SIMPLE_PINHOLE": (0, [50.0, 19.0, 33.0]),
@@ -112,8 +112,8 @@ def test_points_fall_where_colmap_projects_them(
         )
         local = POINTS @ rotation.T + translation(i)
         expected = camera.img_from_cam(local)
-        settled = scene.points @ view.camera.rotation.T + view.camera.translation
-        x, y = (settled[:, :2] / settled[:, 2:]).T
+        normalized = scene.points @ view.camera.rotation.T + view.camera.translation
+        x, y = (normalized[:, :2] / normalized[:, 2:]).T
         if view.lens is None:
             c = view.camera
             found = np.stack([c.fx * x + c.cx, c.fy * y + c.cy], 1)

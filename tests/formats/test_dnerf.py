@@ -15,10 +15,10 @@ from datasets import dnerf_frames, noise, pose, write_dnerf, write_json, write_p
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gsdmsr_cli.errors import DataError
 from gsdmsr_cli.formats import read_scene
 from gsdmsr_cli.formats._transforms import world_to_camera
-from gsdmsr_cli.scene import Scene
+from gsdmsr_cli.ground.errors import DataError
+from gsdmsr_cli.scene.scene import Scene
 
 Edit = Callable[[dict[str, Any]], None]
 

@@ -14,8 +14,8 @@ from datasets import noise, write_json, write_picture
 from refusals import assert_refused
 
 from gsdmsr_cli.formats import read_scene
-from gsdmsr_cli.pictures import Pictures
-from gsdmsr_cli.scene import Scene
+from gsdmsr_cli.scene.pictures import Pictures
+from gsdmsr_cli.scene.scene import Scene
 
 POINTS = np.random.default_rng(5).normal(size=(200, 3)) * 0.3 + [1.0, 2.0, 3.0]
 
@@ -94,8 +94,8 @@ def test_points_fall_on_the_pixels_that_the_format_defines(tmp_path: Path, scale
         camera, lens = view.camera, view.lens
         assert lens is not None and view.name == f"{i:06d}"
         assert (camera.width, camera.height) == (40 // scale, 64 // scale)
-        for settled, point in zip(scene.points[::20].astype(float), POINTS[::20], strict=True):
-            x, y, z = camera.rotation @ settled + camera.translation
+        for normalized, point in zip(scene.points[::20].astype(float), POINTS[::20], strict=True):
+            x, y, z = camera.rotation @ normalized + camera.translation
             column, row = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
             u, v = lens.project(
                 np.array((column - camera.cx) / camera.fx), np.array((row - camera.cy) / camera.fy)
@@ -162,7 +162,7 @@ def test_the_papers_resolution_is_taken_where_it_is_there(folder: Path) -> None:
     assert read_scene(folder).views[0].image_path.parent == folder / "rgb" / "2x"
 
 
-def test_a_capture_without_points_is_settled_by_its_cameras(folder: Path) -> None:
+def test_a_capture_without_points_is_normalized_by_its_cameras(folder: Path) -> None:
     (folder / "points.npy").unlink()
     scene = read_scene(folder)
     assert scene.points.shape == (0, 3)
@@ -249,7 +249,7 @@ def test_the_fingerprint_follows_cameras_and_splits(folder: Path) -> None:
     assert len({first, second, again()}) == 3
 
 
-def settled_axes(scene: Scene) -> np.ndarray:
+def normalized_axes(scene: Scene) -> np.ndarray:
     return np.stack([view.camera.rotation[2] for view in scene.split("train")])
 
 
@@ -262,5 +262,5 @@ def test_a_real_capture(shared_data: Path) -> None:
     assert view.lens is not None and view.lens.fx == pytest.approx(716.3578 / 2, rel=1e-6)
     # walking round a cake, all cameras have it before them
     towards = np.stack([-v.camera.centre for v in scene.split("train")])
-    assert (np.einsum("vi,vi->v", towards, settled_axes(scene)) > 1).all()
+    assert (np.einsum("vi,vi->v", towards, normalized_axes(scene)) > 1).all()
     assert 2 < scene.radius < 8

@@ -13,10 +13,10 @@ import pytest
 from datasets import noise, pose, write_json, write_picture
 from refusals import assert_refused
 
-from gsdmsr_cli.errors import DataError
 from gsdmsr_cli.formats import read_scene
-from gsdmsr_cli.pictures import Pictures
-from gsdmsr_cli.scene import Scene
+from gsdmsr_cli.ground.errors import DataError
+from gsdmsr_cli.scene.pictures import Pictures
+from gsdmsr_cli.scene.scene import Scene
 
 POINTS = np.random.default_rng(5).normal(size=(60, 3)) * 0.3
 COLOURS = np.random.default_rng(6).integers(0, 256, (60, 3))
@@ -68,7 +68,7 @@ def edit(folder: Path, change: Callable[[dict[str, Any]], Any]) -> Scene:
     return read_scene(folder)
 
 
-def test_a_scene_is_read_and_settled(folder: Path) -> None:
+def test_a_scene_is_read_and_declared(folder: Path) -> None:
     scene = read_scene(folder)
     assert scene.layout == "nerfstudio" and scene.duration is None
     assert [view.name for view in scene.split("test")] == ["f0", "f8"]
@@ -98,7 +98,7 @@ def test_points_project_as_blenders_axes_say(folder: Path) -> None:
     assert found == pytest.approx(expected, abs=1e-4)
 
 
-def test_what_prepare_has_settled_stays_where_it_is(folder: Path) -> None:
+def test_what_prepare_has_declared_stays_where_it_is(folder: Path) -> None:
     about = {"gsdmsr": 1, "bound": 2.5, "duration": 4.0}
     write_json(folder / "scene.json", about)
     scene = read_scene(folder)
@@ -108,7 +108,7 @@ def test_what_prepare_has_settled_stays_where_it_is(folder: Path) -> None:
     np.testing.assert_allclose(centres[2], np.array(pose(azimuth=0.8))[:3, 3], atol=1e-12)
 
 
-def test_another_tools_scene_file_settles_nothing(folder: Path) -> None:
+def test_another_tools_scene_file_declares_nothing(folder: Path) -> None:
     before = read_scene(folder)
     write_json(folder / "scene.json", {"bound": 2.5})
     assert read_scene(folder).bound == before.bound != 2.5
@@ -156,8 +156,8 @@ def test_masks_of_what_counts_and_of_what_moves(folder: Path) -> None:
     first, second, third = edit(folder, name).views[:3]
     pictures = Pictures((1.0, 1.0, 1.0), 1, 1 << 20)
     for view in (first, third):
-        assert pictures.counted(view) is None and pictures.moving(view) is None
-    counted, moving = pictures.counted(second), pictures.moving(second)
+        assert not view.signals
+    counted, moving = (pictures.signal(second, name) for name in ("mask", "moving"))
     assert counted is not None and moving is not None
     assert (counted.numpy() == (mask[..., 0] > 0)).all() and (moving.numpy() == ~counted).all()
 
@@ -192,7 +192,7 @@ def top(edit: Callable[[dict[str, Any]], Any]) -> Callable[[Path], None]:
     return lambda folder: change(folder, edit)
 
 
-def settled(**fields: Any) -> Callable[[Path], None]:
+def declared(**fields: Any) -> Callable[[Path], None]:
     return lambda folder: write_json(folder / "scene.json", {"gsdmsr": 1, **fields})
 
 
@@ -218,9 +218,9 @@ BAD: dict[str, tuple[Callable[[Path], Any], str]] = {
     "points outside": (top(lambda d: d.update(ply_file_path="../p.ply")), "leads out of"),
     "points a number": (top(lambda d: d.update(ply_file_path=3)), "it must name a file"),
     "points no PLY": (lambda f: (f / "points.ply").write_text("hello"), "is not a PLY file"),
-    "no bound": (settled(), "bound is None"),
-    "bound 0": (settled(bound=0), "bound is 0.0; it must be above 0"),
-    "duration NaN": (settled(bound=1, duration=math.nan), "duration is nan"),
+    "no bound": (declared(), "bound is None"),
+    "bound 0": (declared(bound=0), "bound is 0.0; it must be above 0"),
+    "duration NaN": (declared(bound=1, duration=math.nan), "duration is nan"),
 }
 
 

@@ -11,10 +11,10 @@ import pytest
 from datasets import noise, write_picture
 from refusals import assert_refused
 
-from gsdmsr_cli.errors import DataError
 from gsdmsr_cli.formats import neural3d, read_scene
-from gsdmsr_cli.imaging import read_image
-from gsdmsr_cli.native import cv2
+from gsdmsr_cli.ground.errors import DataError
+from gsdmsr_cli.scene.imaging import read_image
+from gsdmsr_cli.scene.native import cv2
 
 CAMERAS, FRAMES = 3, 5
 WIDTH, HEIGHT = 64, 48
@@ -66,7 +66,7 @@ def test_cameras_are_llffs(folder: Path) -> None:
     first, last = scene.views[0].camera, scene.views[-1].camera
     np.testing.assert_allclose(first.rotation, np.eye(3), atol=1e-12)
     assert (first.fx, first.fy, first.cx, first.cy) == (60, 60, 32, 24)
-    # parallel lines of sight: settled at the geometric mean of the depths, 4, which becomes 4
+    # parallel lines of sight: placed at the geometric mean of the depths, 4, which becomes 4
     np.testing.assert_allclose(last.centre - first.centre, [2, 0, 0], atol=1e-12)
     np.testing.assert_allclose([c.centre[2] for c in (first, last)], -4, atol=1e-12)
 

@@ -15,7 +15,7 @@ from datasets import noise, write_json, write_picture
 from refusals import assert_refused
 
 from gsdmsr_cli.formats import read_scene
-from gsdmsr_cli.pictures import Pictures
+from gsdmsr_cli.scene.pictures import Pictures
 
 MOMENTS, WIDTH, HEIGHT = 3, 32, 24
 TRAIN, TEST = (1, 4, 7), (0,)
@@ -88,8 +88,8 @@ def test_points_project_as_before(folder: Path) -> None:
 
 def test_what_moves_is_1_in_seg(folder: Path) -> None:
     view = read_scene(folder).views[0]
-    moving = Pictures((0.0, 0.0, 0.0), 1, 1 << 20).moving(view)
-    assert moving is not None and view.mask_path is None
+    moving = Pictures((0.0, 0.0, 0.0), 1, 1 << 20).signal(view, "moving")
+    assert moving is not None and view.signals.keys() == {"moving"}
     assert moving[:, :10].all() and not moving[:, 10:].any()
 
 
@@ -99,7 +99,7 @@ def test_seg_points_and_the_test_split_may_be_missing(folder: Path) -> None:
     (folder / "test_meta.json").unlink()
     scene = read_scene(folder)
     assert len(scene.views) == 9 and not len(scene.points)
-    assert all(view.moving_path is None for view in scene.views)
+    assert not any(view.signals for view in scene.views)
     for view in scene.views:  # the lines of sight meet 5 units ahead
         np.testing.assert_allclose(view.camera.translation, [0, 0, 4], atol=1e-3)
 

@@ -1,4 +1,4 @@
-"""What a settled world promises, of captures with and without points."""
+"""Normalised worlds of captures with and without points: where they lie, and how large they are."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gsdmsr_cli.camera import Camera, look_at
-from gsdmsr_cli.formats._world import DISTANCE, NEAREST, World, settle
-from gsdmsr_cli.scene import View
+from gsdmsr_cli.formats._world import DISTANCE, NEAREST, World, normalize
+from gsdmsr_cli.scene.camera import Camera, look_at
+from gsdmsr_cli.scene.scene import View
 
 UP = np.array([0.0, 0.0, 1.0])
 
@@ -40,13 +40,13 @@ def test_pictures_stay_what_they_are(scale: float) -> None:
     target = scale * np.array([10.0, -20.0, 5.0])
     points = target + scale * np.random.default_rng(0).normal(size=(300, 3)) * 0.2
     views = ring(target, 2 * scale)
-    world = settle(views, points)
-    settled = world.views(views)
-    for before, after in zip(views, settled, strict=True):
+    world = normalize(views, points)
+    normalized = world.views(views)
+    for before, after in zip(views, normalized, strict=True):
         expected = project(before.camera, points)
         np.testing.assert_allclose(project(after.camera, world.points(points)), expected, atol=0.01)
         np.testing.assert_allclose(after.camera.rotation, before.camera.rotation)
-    assert np.median(depths(settled, world.points(points))) == pytest.approx(DISTANCE, rel=1e-3)
+    assert np.median(depths(normalized, world.points(points))) == pytest.approx(DISTANCE, rel=1e-3)
     assert np.abs(world.points(points)).max(axis=1) == pytest.approx(
         np.abs(world.points(points)).max(axis=1).clip(0, 3 * world.bound)
     )
@@ -56,9 +56,9 @@ def test_pictures_stay_what_they_are(scale: float) -> None:
 def test_strays_move_nothing() -> None:
     target = np.array([3.0, 2.0, 1.0])
     points = target + np.random.default_rng(1).normal(size=(1000, 3)) * 0.2
-    clean = settle(ring(target, 2.0), points)
+    clean = normalize(ring(target, 2.0), points)
     points[:5] = 1e6
-    soiled = settle(ring(target, 2.0), points)
+    soiled = normalize(ring(target, 2.0), points)
     assert soiled.scale == pytest.approx(clean.scale, rel=0.02)
     assert soiled.bound == pytest.approx(clean.bound, rel=0.1)
     np.testing.assert_allclose(soiled.centre, clean.centre, atol=0.02)
@@ -71,7 +71,7 @@ def test_near_things_are_not_cut_off() -> None:
     near = np.array([0.2, 1.0, 0]) + 0.05 * rng.normal(size=(100, 3))
     far = np.array([0.2, 100.0, 0]) + rng.normal(size=(300, 3))
     points = np.concatenate([near, far])
-    world = settle(views, points)
+    world = normalize(views, points)
     found = depths(world.views(views), world.points(points))
     assert np.quantile(found, 0.02) == pytest.approx(NEAREST, rel=0.15)
 
@@ -79,7 +79,7 @@ def test_near_things_are_not_cut_off() -> None:
 def test_without_points_the_lines_of_sight_tell() -> None:
     target = np.array([7.0, -3.0, 2.0])
     views = ring(target, 5.0)
-    world = settle(views, np.zeros((0, 3)))
+    world = normalize(views, np.zeros((0, 3)))
     np.testing.assert_allclose(world.centre, target, atol=1e-4)
     for view in world.views(views):
         assert np.linalg.norm(view.camera.centre) <= np.sqrt(3) * world.bound
@@ -89,12 +89,12 @@ def test_without_points_the_lines_of_sight_tell() -> None:
 @pytest.mark.parametrize("known", [None, (1.0, 16.0)])
 def test_parallel_lines_of_sight_have_a_middle_depth(known: tuple[float, float] | None) -> None:
     views = [view_at(np.array([i, 0, 0.0]), np.array([i, 1.0, 0])) for i in range(5)]
-    world = settle(views, np.zeros((0, 3)), known)
+    world = normalize(views, np.zeros((0, 3)), known)
     distance = 4.0 if known else 2.0  # the mean of the depths' logarithms, or the cameras' spread
     np.testing.assert_allclose(world.centre, [2, distance, 0], atol=1e-9)
     assert world.scale == pytest.approx(DISTANCE / distance)
 
 
 def test_a_single_camera_has_a_world_too() -> None:
-    world = settle([view_at(np.zeros(3), np.array([0, 1.0, 0]))], np.zeros((0, 3)))
+    world = normalize([view_at(np.zeros(3), np.array([0, 1.0, 0]))], np.zeros((0, 3)))
     assert isinstance(world, World) and np.isfinite(world.centre).all() and world.bound > 0

@@ -9,14 +9,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gsdmsr_cli.camera import Camera, look_at
-from gsdmsr_cli.errors import DataError, UsageError
-from gsdmsr_cli.film import PathOptions
 from gsdmsr_cli.formats import read_scene
+from gsdmsr_cli.ground.errors import DataError, UsageError
 from gsdmsr_cli.paths import make_film, path_names
 from gsdmsr_cli.paths.dolly import REACH, dolly
 from gsdmsr_cli.paths.spiral import spiral
-from gsdmsr_cli.scene import Scene
+from gsdmsr_cli.scene.camera import Camera, look_at
+from gsdmsr_cli.scene.film import PathOptions
+from gsdmsr_cli.scene.scene import Scene
 
 ORIGIN, Z = np.zeros(3), np.array([0.0, 0.0, 1.0])
 VIEWS = {"still": ("val/r_001",), "interpolate": ("test/r_000", "test/r_002", "test/r_001")}

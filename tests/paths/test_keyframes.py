@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from gsdmsr_cli.errors import DataError
-from gsdmsr_cli.film import Film, PathOptions
 from gsdmsr_cli.formats import read_scene
+from gsdmsr_cli.ground.errors import DataError
 from gsdmsr_cli.paths import make_film
-from gsdmsr_cli.scene import Scene
+from gsdmsr_cli.scene.film import Film, PathOptions
+from gsdmsr_cli.scene.scene import Scene
 
 VIEW = {"view": "test/r_000", "time": 0.25}
 OWN = {"position": [3.0, 0.0, 1.0], "look_at": [0.0, 0.0, 0.2], "time": 1.0}

@@ -11,10 +11,10 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gsdmsr_cli.camera import Camera, look_at
-from gsdmsr_cli.geometry import quat_to_rotmat
+from gsdmsr_cli.ground.geometry import quat_to_rotmat
 from gsdmsr_cli.paths._around import STEEPEST, common_up
 from gsdmsr_cli.paths.orbit import orbit
+from gsdmsr_cli.scene.camera import Camera, look_at
 
 Z = np.array([0.0, 0.0, 1.0])
 ORIGIN = np.zeros(3)

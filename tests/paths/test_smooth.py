@@ -1,4 +1,4 @@
-"""Ways through cameras: exactly through every key, smooth, and with the scene in the picture."""
+"""Smooth camera paths: exactly through every key, smooth, and with the scene in the picture."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 from scipy.interpolate import CubicHermiteSpline
 from scipy.spatial.transform import Rotation, Slerp
 
-from gsdmsr_cli.camera import Camera, look_at
 from gsdmsr_cli.paths import _quaternions
-from gsdmsr_cli.paths._smooth import Key, hermite, lengths, through, turned
+from gsdmsr_cli.paths._smooth import Key, hermite, interpolate, lengths, turned
+from gsdmsr_cli.scene.camera import Camera, look_at
 
 SEEDS = st.integers(0, 2**31)
 
@@ -124,9 +124,9 @@ def test_the_spline_is_the_cubic_hermite_spline_of_its_slopes() -> None:
 
 
 @pytest.mark.parametrize("count", [2, 3, 4])
-def test_the_way_leads_exactly_through_every_key(count: int) -> None:
+def test_the_path_leads_exactly_through_every_key(count: int) -> None:
     keys, knots = KEYS[-count:], KNOTS[:count]
-    for key, shot in zip(keys, through(keys, knots, knots), strict=True):
+    for key, shot in zip(keys, interpolate(keys, knots, knots), strict=True):
         np.testing.assert_allclose(
             shot.camera.world_to_camera, key.camera.world_to_camera, atol=1e-9
         )
@@ -137,7 +137,7 @@ def test_the_way_leads_exactly_through_every_key(count: int) -> None:
 
 def test_what_all_keys_look_at_stays_in_the_middle() -> None:
     keys = KEYS[:3]
-    for shot in through(keys, KNOTS[:3], np.linspace(0, 2.5, 40)):
+    for shot in interpolate(keys, KNOTS[:3], np.linspace(0, 2.5, 40)):
         x, y, z = shot.camera.translation  # where the origin is seen from
         assert abs(x) < 1e-9 and abs(y) < 1e-9
         assert 3 < z < 5
@@ -145,7 +145,7 @@ def test_what_all_keys_look_at_stays_in_the_middle() -> None:
 
 def test_cameras_that_look_away_from_the_origin_are_joined_by_a_spline_of_their_centres() -> None:
     away = [Key(facing([x, 4, 0.5 * x * x], [x, 9, 0.5 * x * x]), 0.0) for x in (0, 1, 3)]
-    shots = through(away, np.array([0.0, 1.0, 3.0]), np.linspace(0, 3, 13))
+    shots = interpolate(away, np.array([0.0, 1.0, 3.0]), np.linspace(0, 3, 13))
     for i, shot in enumerate(shots):
         x = i / 4
         np.testing.assert_allclose(shot.camera.centre, [x, 4, 0.5 * x * x], atol=1e-9)
@@ -154,7 +154,7 @@ def test_cameras_that_look_away_from_the_origin_are_joined_by_a_spline_of_their_
 def test_keys_of_other_sizes_keep_their_field_of_view() -> None:
     small = facing([4, 0, 1])
     large = facing([0, 4, 1], fx=50.0, fy=50.0).resized(400, 300)
-    shot = through([Key(small, 0), Key(large, 0)], np.array([0.0, 1.0]), np.array([1.0]))[0]
+    shot = interpolate([Key(small, 0), Key(large, 0)], np.array([0.0, 1.0]), np.array([1.0]))[0]
     assert (shot.camera.width, shot.camera.fx) == (40, pytest.approx(50.0))
 
 

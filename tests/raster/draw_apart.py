@@ -33,7 +33,7 @@ def main() -> None:
     import numba
     from numba.core.registry import cpu_target
 
-    from gsdmsr_cli.kernels import jit
+    from gsdmsr_cli.backends.cpu import jit
 
     numbers = drawn()
     target = " ".join(cpu_target.target_context.codegen().magic_tuple())

@@ -2,26 +2,28 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from gsdmsr_cli.camera import Camera, look_at
-from gsdmsr_cli.frame import Frame
-from gsdmsr_cli.geometry import SH_C0
+from gsdmsr_cli.gaussians.frame import Frame
+from gsdmsr_cli.gaussians.moment import Moment
+from gsdmsr_cli.gaussians.splats import Splats
+from gsdmsr_cli.ground.geometry import SH_C0, quat_to_rotmat
+from gsdmsr_cli.ground.splatting_constants import ALPHA_MAX, ALPHA_MIN, NEAR, TILE
 from gsdmsr_cli.raster import Engine, reference
-from gsdmsr_cli.splats import Splats
-from gsdmsr_cli.splatting_constants import ALPHA_MAX, ALPHA_MIN, NEAR, TILE
+from gsdmsr_cli.scene.camera import Camera, look_at
 
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """One picture to draw; splats are float32 on the CPU.
+    """One picture to draw; tensors are float32 on the CPU.
 
     past_stop says that pixels are finished while splats are left: an engine may blend those or
     not, see TRANSMITTANCE_STOP.
@@ -33,6 +35,13 @@ class Case:
     sh_degree: int | None = None
     with_depth: bool = True
     past_stop: bool = False
+    axes: Tensor | None = None
+    features: Tensor | None = None
+
+    @property
+    def moment(self) -> Moment:
+        """What is drawn."""
+        return Moment(self.splats, self.axes, self.features)
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,6 +135,21 @@ def _outside_the_margin() -> Case:
     return Case(replace(large, means=at_pixels(view, pixels, depths)), view, torch.ones(3))
 
 
+def with_axes(of: Case, seed: int = 22) -> Case:
+    """Return the case with covariances by axes, turned from the right, and no quats and scales."""
+    rng = torch.Generator().manual_seed(seed)
+    turns = quat_to_rotmat(torch.randn(len(of.splats), 4, generator=rng))
+    scaled = quat_to_rotmat(of.splats.quats) * of.splats.log_scales.exp().unsqueeze(1)
+    nothing = {n: torch.full_like(getattr(of.splats, n), math.nan) for n in ("quats", "log_scales")}
+    return replace(of, splats=replace(of.splats, **nothing), axes=scaled @ turns)
+
+
+def with_features(of: Case, count: int, seed: int = 23) -> Case:
+    """Return the case with so many features, below 0 as well."""
+    rng = torch.Generator().manual_seed(seed)
+    return replace(of, features=torch.randn(len(of.splats), count, generator=rng))
+
+
 def _needles() -> Splats:
     some = splats(60, seed=18)
     return replace(some, log_scales=some.log_scales + torch.tensor([1.5, -4.0, -4.0]))
@@ -141,6 +165,18 @@ def poisoned() -> tuple[Case, Case, Tensor]:
     finite = torch.cat([torch.tensor([0]), torch.arange(16, 48)])
     sick = _case(50, 37, some)
     return sick, replace(sick, splats=some.take(finite)), finite
+
+
+def poisoned_moment() -> tuple[Case, Case, Tensor]:
+    """The same of a case with axes and features, in which these have rows that are not finite."""
+    sick = with_features(with_axes(_case(50, 37, splats(48, seed=24))), 5)
+    assert sick.axes is not None and sick.features is not None
+    for i, value in enumerate((math.nan, math.inf, -math.inf)):
+        sick.axes[1 + i, i, 2 - i] = value
+        sick.features[4 + i, 2 * i] = value
+    finite = torch.cat([torch.tensor([0]), torch.arange(7, 48)])
+    kept = {"axes": sick.axes[finite], "features": sick.features[finite]}
+    return sick, replace(sick, splats=sick.splats.take(finite), **kept), finite
 
 
 def overflowing() -> Case:
@@ -191,23 +227,47 @@ CASES: dict[str, Callable[[], Case]] = {
     "active degree 2 of 3": lambda: replace(CASES["sh degree 3"](), sh_degree=2),
     "saturated": lambda: _case(40, 33, splats(30, seed=17, logit=(12.0, 3.0))),
     "without depth": lambda: replace(CASES["50x37"](), with_depth=False),
-}
+} | {
+    f"{name}, axes": partial(lambda name: with_axes(CASES[name]()), name)
+    for name in (
+        "1x1", "17x33", "more than a batch in a tile", "tile edges", "behind and at the near plane",
+        "outside the margin", "zero splats", "none in view", "tiny", "huge", "needles",
+        "off-centre, fx != fy", "sh degree 3", "saturated", "without depth",
+    )
+}  # fmt: skip
+CASES["one splat, axes"] = lambda: with_axes(_case(17, 9, splats(1, seed=25, logit=(2.0, 0.0))))
+"""By name; without features."""
+
+WITH_FEATURES: dict[str, Callable[[], Case]] = {
+    f"{name}, {count} features": partial(
+        lambda name, count: with_features(CASES[name](), count), name, count
+    )
+    for name, count in (
+        ("1x1", 3), ("17x33", 1), ("50x37", 9), ("more than a batch in a tile", 4),
+        ("zero splats", 9), ("none in view", 1), ("needles", 4), ("saturated", 9),
+        ("without depth", 3), ("zero splats, axes", 3), ("17x33, axes", 9),
+        ("needles, axes", 3), ("saturated, axes", 4), ("one splat, axes", 1),
+        ("off-centre, fx != fy, axes", 9),
+    )
+}  # fmt: skip
+"""Further ones, which are drawn but not compared in one go."""
 
 
 @cache
 def case(name: str) -> Case:
-    """Return one of CASES; nobody may write to its tensors."""
-    return CASES[name]()
+    """Return one of CASES or WITH_FEATURES; nobody may write to its tensors."""
+    return (CASES | WITH_FEATURES)[name]()
 
 
 def draw(engine: Engine, scene: Case, weights: Tensor, device: str, dtype: torch.dtype) -> Drawing:
-    """Draw the case and differentiate its pixels times the (H, W, 5) weights."""
-    leaves = scene.splats.map(lambda t: t.to(device, dtype, copy=True).requires_grad_())
+    """Draw the case and differentiate its pixels times the (H, W, 5 + F) weights."""
+    leaves = scene.moment.map(lambda t: t.to(device, dtype, copy=True).requires_grad_())
     background = scene.background.to(device, dtype)
     frame = engine.rasterize(leaves, scene.camera, background, scene.sh_degree, scene.with_depth)
     frame.means2d.retain_grad()
     depth = frame.alpha * 0 if frame.depth is None else frame.depth
-    pixels = torch.cat([frame.rgb, frame.alpha.unsqueeze(-1), depth.unsqueeze(-1)], -1)
+    parts = [frame.rgb, frame.alpha.unsqueeze(-1), depth.unsqueeze(-1)]
+    pixels = torch.cat(parts if frame.features is None else [*parts, frame.features], -1)
     (pixels * weights.to(pixels)).sum().backward()
     gradients = {}
     for name, tensor in {**leaves.tensors(), "means2d": frame.means2d}.items():
@@ -218,8 +278,9 @@ def draw(engine: Engine, scene: Case, weights: Tensor, device: str, dtype: torch
 
 
 def pixel_weights(scene: Case, seed: int = 0) -> Tensor:
-    """Random (H, W, 5) weights of rgb, alpha and depth; 0 at pixels that ``ambiguous`` names."""
-    shape = (scene.camera.height, scene.camera.width, 5)
+    """Random (H, W, 5 + F) weights of rgb, alpha, depth and features; 0 where ``ambiguous``."""
+    channels = 5 if scene.features is None else 5 + scene.features.shape[1]
+    shape = (scene.camera.height, scene.camera.width, channels)
     weights = torch.randn(shape, generator=torch.Generator().manual_seed(seed))
     return weights.double() * ~ambiguous(scene).unsqueeze(-1)
 
@@ -232,7 +293,7 @@ def ambiguous(scene: Case, margin: float = 1e-4) -> Tensor:
     At the cut-off the picture jumps by up to ALPHA_MIN and at saturation the gradient jumps to 0,
     so there no float32 engine can be held to a float64 one. The margin is relative.
     """
-    view, exact = scene.camera, scene.splats.map(torch.Tensor.double)
+    view, exact = scene.camera, scene.moment.map(torch.Tensor.double)
     drawn = reference.rasterize(exact, view, scene.background.double()).radii.nonzero().squeeze(-1)
     seen = reference.project(exact.take(drawn), view)
     xs, ys = torch.arange(view.width) + 0.5, torch.arange(view.height) + 0.5

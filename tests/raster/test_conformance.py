@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
-from functools import cache, partial
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from functools import cache
 
 import pytest
 import torch
 from raster_scenes import (
     CASES,
+    WITH_FEATURES,
     Case,
     Drawing,
     ambiguous,
@@ -18,12 +20,13 @@ from raster_scenes import (
     overflowing,
     pixel_weights,
     poisoned,
+    poisoned_moment,
 )
 from torch import Tensor
 
+from gsdmsr_cli.ground.splatting_constants import ALPHA_MAX, TRANSMITTANCE_STOP, tile_grid
 from gsdmsr_cli.raster import Comparing, Engine, engine_names, load_engine, reference
-from gsdmsr_cli.splatting_constants import ALPHA_MAX, TRANSMITTANCE_STOP, tile_grid
-from gsdmsr_cli.training.look import draw_and_compare
+from gsdmsr_cli.training.gradients.compare import compare_frame
 
 FORWARD = 1e-4  # largest error of a pixel; of depth, relative to the farthest splat
 BACKWARD = 1e-3  # error of a gradient in the L2 norm, relative
@@ -72,22 +75,23 @@ def farthest(of: Case, radii: Tensor) -> float:
     return max([1.0, *depths.tolist()])
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", CASES | WITH_FEATURES)
 def test_pictures_match_the_reference(placed: Placed, name: str) -> None:
     found, exact = drawings(placed, name)
     compared = ~ambiguous(case(name))
     assert compared.double().mean() >= 1 - MOST_AMBIGUOUS
     assert found.frame.rgb.dtype == torch.float32
-    for image in ("rgb", "alpha", "depth"):
+    absent = {"depth": not case(name).with_depth, "features": case(name).features is None}
+    for image in ("rgb", "alpha", "depth", "features"):
         ours, truth = getattr(found.frame, image), getattr(exact.frame, image)
-        assert (ours is None) == (truth is None) == (image == "depth" and not case(name).with_depth)
+        assert (ours is None) == (truth is None) == absent.get(image, False)
         if truth is not None:
             assert ours.shape == truth.shape
             scale = farthest(case(name), exact.frame.radii) if image == "depth" else 1.0
             assert (ours - truth)[compared].abs().max() <= FORWARD * scale, image
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", CASES | WITH_FEATURES)
 def test_gradients_match_the_reference(placed: Placed, name: str) -> None:
     found, exact = drawings(placed, name)
     right = [exact, drawing_that_never_stops(name)] if case(name).past_stop else [exact]
@@ -97,7 +101,7 @@ def test_gradients_match_the_reference(placed: Placed, name: str) -> None:
         assert any((ours - truth).norm() <= BACKWARD * truth.norm() for truth in truths), tensor
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", CASES | WITH_FEATURES)
 def test_radii_and_screen_means_match_the_reference(placed: Placed, name: str) -> None:
     found, exact = (drawing.frame for drawing in drawings(placed, name))
     # Engines may round a radius up, and drop a splat that touches no pixel centre.
@@ -117,7 +121,7 @@ def test_cases_reach_the_places_they_are_named_after() -> None:
         name: draw(reference, case(name), pixel_weights(case(name)), "cpu", torch.float64)
         for name in CASES
     }
-    for name in CASES.keys() - {"zero splats", "none in view"}:
+    for name in CASES.keys() - {n for n in CASES if n.startswith(("zero splats", "none in view"))}:
         assert drawn[name].frame.alpha.max() > 0.1, name
         for tensor, gradient in drawn[name].gradients.items():
             assert gradient.norm() > 0, (name, tensor)
@@ -134,7 +138,10 @@ def test_cases_reach_the_places_they_are_named_after() -> None:
     assert drawn["saturated"].frame.alpha.max() > ALPHA_MAX
 
 
-def test_rows_that_are_not_finite_are_as_if_absent(placed: Placed) -> None:
+@pytest.mark.parametrize("poisoned", [poisoned, poisoned_moment])
+def test_rows_that_are_not_finite_are_as_if_absent(
+    placed: Placed, poisoned: Callable[[], tuple[Case, Case, Tensor]]
+) -> None:
     sick, healthy, finite = poisoned()
     weights = pixel_weights(sick)
     found = draw(placed[0], sick, weights, placed[1], torch.float32)
@@ -146,16 +153,47 @@ def test_rows_that_are_not_finite_are_as_if_absent(placed: Placed) -> None:
     absent = torch.ones(len(sick.splats), dtype=torch.bool)
     absent[finite] = False
     assert not found.frame.radii[absent].any()
+    if sick.features is not None:
+        assert torch.equal(found.frame.features, expected.frame.features)
     for name, gradient in found.gradients.items():
         assert not gradient[absent].any(), name
         torch.testing.assert_close(gradient[finite], expected.gradients[name])
+
+
+def test_quats_and_scales_beside_axes_are_not_in_the_graph(placed: Placed) -> None:
+    engine, device = placed
+    of = case("17x33, axes")
+    leaves = of.moment.map(lambda t: t.to(device, copy=True).requires_grad_())
+    engine.rasterize(leaves, of.camera, of.background.to(device)).rgb.sum().backward()
+    assert leaves.axes is not None and leaves.axes.grad is not None
+    assert leaves.splats.quats.grad is None and leaves.splats.log_scales.grad is None
+
+
+def test_axes_that_overflow_spoil_neither_picture_nor_gradients(placed: Placed) -> None:
+    of = case("17x33, axes")
+    assert of.axes is not None
+    axes = of.axes.clone()
+    for row, size in enumerate((1e6, 1e12, 1e20, 3e38, 1e-12, 1e-38, 0.0)):
+        axes[row] = axes[row].sign() * size
+    scene = replace(of, axes=axes)
+    found = draw(placed[0], scene, torch.ones(33, 17, 5), placed[1], torch.float32)
+    for image in (found.frame.rgb, found.frame.alpha, found.frame.depth, found.frame.means2d):
+        assert image is not None and image.isfinite().all()
+    for name, gradient in found.gradients.items():
+        assert gradient.isfinite().all(), name
+    assert (found.frame.radii > 0).sum() > 10
+
+
+def test_features_are_not_compared_in_one_go(placed: Placed) -> None:
+    with pytest.raises(ValueError, match="drawn by rasterize and compared afterwards"):
+        compared(placed, "17x33, 1 features", 0.2)
 
 
 def test_values_that_overflow_spoil_neither_picture_nor_gradients(placed: Placed) -> None:
     scene = overflowing()
     found = draw(placed[0], scene, torch.ones(18, 20, 5), placed[1], torch.float32)
     for image in vars(found.frame).values():
-        assert image.isfinite().all()
+        assert image is None or image.isfinite().all()
     for name, gradient in found.gradients.items():
         assert gradient.isfinite().all(), name
     assert (found.frame.radii > 0).sum() > 10
@@ -183,16 +221,19 @@ def compared(
     shape = 3, of.camera.height, of.camera.width
     target = torch.randint(256, shape, generator=rng, dtype=torch.uint8).to(device)
     background = of.background.to(device)
-    leaves = of.splats.map(lambda t: t.detach().clone().to(device).requires_grad_())
+    leaves = of.moment.map(lambda t: t.detach().clone().to(device).requires_grad_())
     tensors = list(leaves.tensors().values())
     weights = None
     if chosen:
         tiles = math.prod(tile_grid(of.camera.width, of.camera.height))
         weights = torch.rand(tiles, generator=rng).to(device) * 3
         weights[::3] = 0
+    frame = engine.rasterize(leaves, of.camera, background, of.sh_degree)
     results = []
-    for compare in (engine.compare, partial(draw_and_compare, engine)):
-        found = compare(leaves, of.camera, background, target, ssim, of.sh_degree, weights)
+    for found in (
+        engine.compare(leaves, of.camera, background, target, ssim, of.sh_degree, weights),
+        compare_frame(frame, target, ssim, weights),
+    ):
         gradients = torch.autograd.grad(2 * found.loss, tensors)
         errors = [] if found.errors is None else [found.errors]
         results.append([found.loss, *gradients, found.on_screen, *errors])
@@ -236,7 +277,7 @@ def numba_threads() -> Iterator[None]:
 
 
 @pytest.mark.usefixtures("numba_threads")
-@pytest.mark.parametrize("name", ["64x48", "more than a batch in a tile"])
+@pytest.mark.parametrize("name", ["64x48", "more than a batch in a tile", "17x33, axes"])
 def test_result_does_not_depend_on_the_number_of_threads(name: str) -> None:
     import numba
 
@@ -256,6 +297,7 @@ def test_result_does_not_depend_on_the_number_of_threads(name: str) -> None:
         assert torch.equal(found, expected)
     one, two = drawn
     for image, pixels in vars(one.frame).items():
-        assert torch.equal(pixels, getattr(two.frame, image)), image
+        other = getattr(two.frame, image)
+        assert (pixels is None and other is None) or torch.equal(pixels, other), image
     for tensor, gradient in one.gradients.items():
         assert torch.equal(gradient, two.gradients[tensor]), tensor

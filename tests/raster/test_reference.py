@@ -3,20 +3,30 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
-from raster_scenes import at_pixels, camera, case, draw, pixel_weights, poisoned, splats
+from raster_scenes import (
+    Case,
+    at_pixels,
+    camera,
+    case,
+    draw,
+    pixel_weights,
+    poisoned,
+    poisoned_moment,
+    splats,
+)
 from torch import Tensor
 
-from gsdmsr_cli.camera import Camera
-from gsdmsr_cli.frame import Frame
-from gsdmsr_cli.geometry import SH_C0, SH_C1, covariance
-from gsdmsr_cli.raster import engine_names, reference
-from gsdmsr_cli.splats import Splats
-from gsdmsr_cli.splatting_constants import (
+from gsdmsr_cli.gaussians.frame import Frame
+from gsdmsr_cli.gaussians.moment import Moment
+from gsdmsr_cli.gaussians.splats import Splats
+from gsdmsr_cli.ground.geometry import SH_C0, SH_C1, covariance, quat_to_rotmat
+from gsdmsr_cli.ground.splatting_constants import (
     ALPHA_MAX,
     ALPHA_MIN,
     DILATION,
@@ -24,6 +34,8 @@ from gsdmsr_cli.splatting_constants import (
     NEAR,
     TRANSMITTANCE_STOP,
 )
+from gsdmsr_cli.raster import engine_names, reference
+from gsdmsr_cli.scene.camera import Camera
 
 AHEAD = Camera(np.eye(4), 50.0, 50.0, 16.5, 16.5, 33, 33)
 CENTRE = (16, 16)
@@ -49,8 +61,9 @@ def balls(
     )
 
 
-def rasterize(of: Splats, view: Camera = AHEAD) -> Frame:
-    return reference.rasterize(of, view, BACKGROUND, with_depth=True)
+def rasterize(of: Splats | Moment, view: Camera = AHEAD) -> Frame:
+    moment = Moment(of) if isinstance(of, Splats) else of
+    return reference.rasterize(moment, view, BACKGROUND, with_depth=True)
 
 
 def falloff(depth: float, scale: float = 0.1) -> Tensor:
@@ -184,6 +197,74 @@ def test_the_ellipse_is_the_projected_covariance() -> None:
     assert frame.radii[0].item() == pytest.approx(math.sqrt(reach * expected.diag().max().item()))
 
 
+def test_the_ellipse_of_axes_is_that_of_their_products() -> None:
+    """A sheared A, which is no rotation times scales."""
+    view = camera(64, 48, fx=60.0, fy=75.0, cx=27.0, cy=29.0)
+    one = splats(1, degree=0, seed=2, logit=(2.0, 0.0)).map(torch.Tensor.double)
+    one = replace(one, means=torch.tensor([[0.25, -0.3, 0.2]], dtype=torch.float64))
+    axes = torch.tensor([[0.3, 0.2, -0.1], [0.0, 0.25, 0.3], [0.1, 0.0, 0.2]]).double()
+    frame = rasterize(Moment(one, axes[None]), view)
+    jacobian = torch.from_numpy(projection_jacobian(view, one.means[0].numpy()))
+    expected = jacobian @ axes @ axes.T @ jacobian.T + DILATION * torch.eye(2)
+    torch.testing.assert_close(conic_of(frame.alpha).inverse(), expected, atol=1e-5, rtol=1e-5)
+
+
+def assert_same_frame(found: Frame, expected: Frame) -> None:
+    for name, image in vars(expected).items():
+        if image is not None:
+            torch.testing.assert_close(getattr(found, name), image, atol=1e-12, rtol=1e-9)
+
+
+def test_axes_along_the_world_are_scales() -> None:
+    sizes = torch.tensor([[0.3, 0.1, 0.2]], dtype=torch.float64)
+    one = replace(balls([4.0], [0.8]), log_scales=sizes.log())
+    found = rasterize(Moment(balls([4.0], [0.8]), torch.diag_embed(sizes)))
+    assert_same_frame(found, rasterize(one))
+    variance = (50 * 0.3 / 4) ** 2 + DILATION, (50 * 0.1 / 4) ** 2 + DILATION
+    offsets = torch.arange(33, dtype=torch.float64) - 16
+    alpha = 0.8 * (-0.5 * (offsets**2 / variance[0] + offsets[:, None] ** 2 / variance[1])).exp()
+    torch.testing.assert_close(found.alpha, alpha.where(alpha >= ALPHA_MIN, 0.0))
+
+
+def test_axes_are_rotations_times_scales_and_turn_freely_from_the_right() -> None:
+    some, view = splats(20, seed=26).map(torch.Tensor.double), camera(30, 20)
+    scaled = quat_to_rotmat(some.quats) * some.log_scales.exp().unsqueeze(1)
+    rng = torch.Generator().manual_seed(27)
+    turns = quat_to_rotmat(torch.randn(20, 4, generator=rng, dtype=torch.float64))
+    expected = rasterize(some, view)
+    assert expected.alpha.max() > 0.5
+    nothing = {n: torch.full_like(getattr(some, n), math.nan) for n in ("quats", "log_scales")}
+    for axes in (scaled, scaled @ turns, -scaled):
+        assert_same_frame(rasterize(Moment(replace(some, **nothing), axes), view), expected)
+
+
+def test_axes_of_no_length_leave_the_dilation() -> None:
+    found = rasterize(Moment(balls([4.0], [0.8]), torch.zeros(1, 3, 3, dtype=torch.float64)))
+    alpha = 0.8 * falloff(4.0, 0.0)
+    torch.testing.assert_close(found.alpha, alpha.where(alpha >= ALPHA_MIN, 0.0))
+
+
+def test_features_blend_as_colours_do_without_background_and_bounds() -> None:
+    pair = balls([5.0, 3.0], [0.6, 0.7])
+    features = torch.tensor([[7.0, 0.5], [-4.0, 0.0]], dtype=torch.float64)
+    frame = rasterize(Moment(pair, features=features))
+    far, near = 0.6 * falloff(5.0), 0.7 * falloff(3.0)
+    far, near = far.where(far >= ALPHA_MIN, 0.0), near.where(near >= ALPHA_MIN, 0.0)
+    through = (1 - near) * far
+    assert frame.features is not None
+    torch.testing.assert_close(frame.features[..., 0], 7 * through - 4 * near)
+    torch.testing.assert_close(frame.features[..., 1], 0.5 * through)
+    assert frame.features.min() < 0
+    assert_same_frame(frame, rasterize(pair))
+
+
+def test_without_features_there_are_none() -> None:
+    assert rasterize(balls([4.0], [0.8])).features is None
+    nobody = Moment(balls([], []), features=torch.zeros(0, 4, dtype=torch.float64))
+    found = rasterize(nobody).features
+    assert found is not None and found.shape == (33, 33, 4) and not found.any()
+
+
 def test_beyond_the_margin_the_jacobian_is_that_of_the_margin() -> None:
     """A ball outside the margin has the ellipse of one on the margin."""
     slope = FRUSTUM_MARGIN * 16.5 / 50
@@ -212,10 +293,12 @@ def test_active_degree_uses_the_first_coefficients() -> None:
     full = splats(20, degree=3).map(torch.Tensor.double)
     low = replace(full, sh=full.sh[:, :4])
     view = camera(24, 20)
-    found = reference.rasterize(full, view, BACKGROUND, sh_degree=1)
-    assert torch.equal(found.rgb, reference.rasterize(low, view, BACKGROUND).rgb)
+    found = reference.rasterize(Moment(full), view, BACKGROUND, sh_degree=1)
+    assert torch.equal(found.rgb, reference.rasterize(Moment(low), view, BACKGROUND).rgb)
     assert found.depth is None
-    assert torch.equal(reference.rasterize(low, view, BACKGROUND, sh_degree=3).rgb, found.rgb)
+    assert torch.equal(
+        reference.rasterize(Moment(low), view, BACKGROUND, sh_degree=3).rgb, found.rgb
+    )
 
 
 def test_colours_are_not_negative() -> None:
@@ -223,7 +306,10 @@ def test_colours_are_not_negative() -> None:
     assert frame.rgb[CENTRE][0].item() == pytest.approx(0.1 * 0.1)
 
 
-def test_rows_that_are_not_finite_are_as_if_absent() -> None:
+@pytest.mark.parametrize("poisoned", [poisoned, poisoned_moment])
+def test_rows_that_are_not_finite_are_as_if_absent(
+    poisoned: Callable[[], tuple[Case, Case, Tensor]],
+) -> None:
     sick, healthy, finite = poisoned()
     weights = pixel_weights(sick)
     found = draw(reference, sick, weights, "cpu", torch.float64)
@@ -262,6 +348,24 @@ def test_gradients_match_finite_differences(degree: int) -> None:
         return frame.rgb, frame.alpha, frame.depth
 
     leaves = [tensor.requires_grad_() for tensor in few.tensors().values()]
+    assert torch.autograd.gradcheck(pictures, leaves)
+
+
+def test_gradients_of_axes_and_features_match_finite_differences() -> None:
+    few = splats(4, seed=28, size=0.4).map(torch.Tensor.double)
+    view = camera(6, 5, fx=7.0, fy=6.0, cx=2.5)
+    rng = torch.Generator().manual_seed(29)
+    axes = 0.4 * torch.randn(4, 3, 3, generator=rng, dtype=torch.float64)
+    features = torch.randn(4, 2, generator=rng, dtype=torch.float64)
+    assert (rasterize(Moment(few, axes, features), view).radii > 0).all()
+
+    def pictures(means: Tensor, logits: Tensor, *further: Tensor) -> tuple[Tensor, ...]:
+        moved = replace(few, means=means, logit_opacities=logits)
+        frame = rasterize(Moment(moved, *further), view)
+        assert frame.depth is not None and frame.features is not None
+        return frame.rgb, frame.alpha, frame.depth, frame.features
+
+    leaves = [t.requires_grad_() for t in (few.means, few.logit_opacities, axes, features)]
     assert torch.autograd.gradcheck(pictures, leaves)
 
 

@@ -7,7 +7,7 @@ from html.parser import HTMLParser
 from typing import Any
 
 import pytest
-from report_pages import LOG, STILLS
+from report_pages import LOG, SHOWN_FRAMES
 from reports import small_report
 
 from gsdmsr_cli.evaluation.gates import Verdict
@@ -61,7 +61,7 @@ def read(text: str) -> Reader:
 
 def made(**changes: Any) -> str:
     document = small_report() | changes
-    return page("a <run>", document, [Verdict("x", False, "a & b")], LOG, STILLS, 0.1)
+    return page("a <run>", document, [Verdict("x", False, "a & b")], LOG, SHOWN_FRAMES, 0.1)
 
 
 def test_the_page_is_well_formed_and_asks_for_nothing_else() -> None:
@@ -89,7 +89,7 @@ def test_every_figure_is_one_of_the_report() -> None:
         "aggregate.psnr", "aggregate.ms_ssim.value", "backgrounds.black.aggregate.psnr",
         "splits.train.psnr", "splits.test.psnr", "splits.val.frames", "frames.0.psnr",
         "frames.1.ssim", "speed.fps", "speed.fps_raster", "training.train_s",
-        "training.stages_s.look", "training.stages_s.other", "training.compile_s",
+        "training.stages_s.gradients", "training.stages_s.other", "training.compile_s",
         "storage.splats_bytes", "storage.motion_bytes", "storage.checkpoint_bytes",
     } <= shown  # fmt: skip
 

@@ -9,10 +9,16 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from kernel_checks import generator
+from torch import Tensor
 from training_checks import preset_of, trainer_of
 
+from gsdmsr_cli.model.parameter import Parameter
 from gsdmsr_cli.training.averaging import EVERY, Average
 from gsdmsr_cli.training.trainer import Trainer
+
+
+def trained(**values: Tensor) -> list[Parameter]:
+    return [Parameter(name, value.clone(), rate="means") for name, value in values.items()]
 
 
 def after(trainer: Trainer, steps: int) -> None:
@@ -26,27 +32,38 @@ def test_it_is_the_mean_of_what_was_added(count: int) -> None:
     values = torch.randn(count, 5, 3, generator=generator(count))
     average = Average()
     for value in values:
-        average.add({"x": value.requires_grad_()})
+        average.add(trained(x=value))
     assert average.count == count
     torch.testing.assert_close(average.tensors["x"], values.mean(0).detach())
     assert not average.tensors["x"].requires_grad
 
 
 def test_it_keeps_no_hold_of_what_was_added() -> None:
-    value, average = torch.ones(3), Average()
-    average.add({"x": value})
-    value += 1
+    (parameter,), average = trained(x=torch.ones(3)), Average()
+    average.add([parameter])
+    with torch.no_grad():
+        parameter.tensor.add_(1)
     assert torch.equal(average.tensors["x"], torch.ones(3))
 
 
-def test_take_follows_a_resize_and_forget_begins_anew() -> None:
+def test_of_what_is_not_trained_the_last_values_count() -> None:
+    """Such as indices, which have no mean."""
+    buffer, average = Parameter("rows", torch.tensor([4, 2])), Average()
+    average.add([buffer])
+    average.add([Parameter("rows", torch.tensor([1, 3]))])
+    assert average.tensors["rows"].tolist() == [1, 3]
+    assert average.tensors["rows"].dtype == torch.int64 and average.count == 2
+
+
+def test_take_follows_a_resize_and_clear_begins_anew() -> None:
     average = Average()
-    average.add({"splats": torch.arange(4.0), "field": torch.ones(2)})
-    average.take(["splats", "not there"], torch.tensor([3, 1]))
+    average.add(trained(splats=torch.arange(4.0), field=torch.ones(2)))
+    for name in ("splats", "not there"):
+        average.take(name, torch.tensor([3, 1]))
     assert average.tensors["splats"].tolist() == [3.0, 1.0]
     assert average.tensors["field"].tolist() == [1.0, 1.0]
-    average.forget()
-    average.add({"splats": torch.zeros(5)})
+    average.clear()
+    average.add(trained(splats=torch.zeros(5)))
     assert average.count == 1 and len(average.tensors["splats"]) == 5
 
 
@@ -95,7 +112,7 @@ def test_a_checkpoint_holds_the_result_and_what_to_go_on_from(tiny_scene: Path, 
     for name, tensor in trainer.result().tensors().items():
         assert torch.equal(checkpoint.tensors[name], tensor), name
     other.restore(checkpoint)
-    assert other.average.count == trainer.average.count
+    assert other.population.average.count == trainer.population.average.count
     for model, copied in ((trainer.model, other.model), (trainer.result(), other.result())):
         for name, tensor in model.tensors().items():
             assert torch.equal(copied.tensors()[name], tensor), name

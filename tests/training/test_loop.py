@@ -1,4 +1,4 @@
-"""The loop: what is told and logged, when checkpoints are saved, and how Ctrl-C ends it."""
+"""The loop: what is reported and logged, when checkpoints are saved, and how Ctrl-C ends it."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ from training_checks import (
     trainer_of,
 )
 
-from gsdmsr_cli.errors import DataError, GsdmsrError
+from gsdmsr_cli.drawing.splatting import draw
 from gsdmsr_cli.evaluation.metrics import psnr, quantize
-from gsdmsr_cli.run import Checkpoint, Run
-from gsdmsr_cli.splatting import draw
+from gsdmsr_cli.ground.errors import DataError, GsdmsrError
+from gsdmsr_cli.runs.run import Checkpoint, Run
 from gsdmsr_cli.training import loop
-from gsdmsr_cli.training.loop import Report, train, watched_view
+from gsdmsr_cli.training.loop import Report, train, validation_view
 from gsdmsr_cli.training.trainer import Step, Trainer
 
 
@@ -71,9 +71,9 @@ def interrupts() -> Any:
 def test_it_trains_to_the_end_and_saves_the_result(
     trainer: Trainer, run: Run, saves: list[int]
 ) -> None:
-    told: list[Report] = []
-    assert train(trainer, run, told.append) is True
-    assert trainer.clock.step == STEPS == told[-1].step and told[-1].progress == 1
+    reports: list[Report] = []
+    assert train(trainer, run, reports.append) is True
+    assert trainer.clock.step == STEPS == reports[-1].step and reports[-1].progress == 1
     assert saves == [STEPS]
     checkpoint = run.load()
     assert (checkpoint.step, checkpoint.progress) == (STEPS, 1.0)
@@ -82,8 +82,8 @@ def test_it_trains_to_the_end_and_saves_the_result(
     assert_same_tensors(copies(model.tensors()), copies(trainer.model.tensors()))
 
 
-def test_every_report_is_told_and_logged(trainer: Trainer, run: Run) -> None:
-    told: list[Report] = []
+def test_every_report_is_passed_on_and_logged(trainer: Trainer, run: Run) -> None:
+    reports: list[Report] = []
     losses: list[float] = []
     step = trainer.step
 
@@ -93,21 +93,22 @@ def test_every_report_is_told_and_logged(trainer: Trainer, run: Run) -> None:
         return made
 
     trainer.step = remember  # type: ignore[method-assign]
-    train(trainer, run, told.append)
+    train(trainer, run, reports.append)
     log = log_of(run)
-    assert log == [report.entry() for report in told]
-    assert len(told) == STEPS  # each step is more than 2 % of this training
+    assert log == [report.entry() for report in reports]
+    assert len(reports) == STEPS  # each step is more than 2 % of this training
     assert [entry["step"] for entry in log] == list(range(1, STEPS + 1))
     assert [entry["loss"] for entry in log] == losses
     assert all(a["elapsed"] <= b["elapsed"] for a, b in pairwise(log))
     assert log[-1]["splats"] == len(trainer.model.splats)
+    assert {entry["dropped"] for entry in log} == {0}
     assert all(entry["ms_per_step"] > 0 and entry["val_psnr"] > 0 for entry in log)
 
 
 def test_a_report_sums_up_the_steps_since_the_last(
     trainer: Trainer, run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(loop, "TELL_EVERY_PROGRESS", 0.35)
+    monkeypatch.setattr(loop, "REPORT_EVERY_PROGRESS", 0.35)
     losses = iter([1.0, 2.0, math.nan, 6.0] + [math.nan] * 10 + [5.0] * 12)
 
     def step() -> Step:
@@ -133,32 +134,32 @@ def test_without_a_finite_loss_the_report_has_none(trainer: Trainer, run: Run) -
 
 
 def test_the_psnr_is_of_the_middle_view_of_val(trainer: Trainer, run: Run) -> None:
-    told: list[Report] = []
-    train(trainer, run, told.append)
+    reports: list[Report] = []
+    train(trainer, run, reports.append)
     view = trainer.scene.split("val")[1]
-    assert watched_view(trainer.scene) is view
+    assert validation_view(trainer.scene) is view
     with torch.no_grad():
-        camera = trainer.observer.pictures.camera(view)
+        camera = trainer.renderer.pictures.camera(view)
         frame = draw(
-            trainer.model, camera, view.time, trainer.observer.engine, trainer.observer.background
+            trainer.model, camera, view.time, trainer.renderer.engine, trainer.renderer.background
         )
-    true = trainer.observer.pictures.load(view).permute(1, 2, 0) / 255
-    assert told[-1].psnr == pytest.approx(psnr(quantize(frame.rgb), true))
-    assert told[-1].psnr != told[0].psnr
+    true = trainer.renderer.pictures.load(view).permute(1, 2, 0) / 255
+    assert reports[-1].psnr == pytest.approx(psnr(quantize(frame.rgb), true))
+    assert reports[-1].psnr != reports[0].psnr
 
 
-def test_without_val_a_train_view_is_watched(trainer: Trainer, run: Run) -> None:
+def test_without_val_a_train_view_is_drawn(trainer: Trainer, run: Run) -> None:
     views = tuple(view for view in trainer.scene.views if view.split != "val")
     trainer.scene = replace(trainer.scene, views=views)
     train(trainer, run, lambda report: None)
-    assert watched_view(trainer.scene) is trainer.scene.split("train")[6]
+    assert validation_view(trainer.scene) is trainer.scene.split("train")[6]
     assert all("train_psnr" in entry and "val_psnr" not in entry for entry in log_of(run))
 
 
 def test_a_model_that_is_not_a_number_has_no_psnr(trainer: Trainer, run: Run) -> None:
     def step() -> Step:
         trainer.clock.step += 1
-        trainer.observer.background = torch.full((3,), math.nan)
+        trainer.renderer.background = torch.full((3,), math.nan)
         return Step(torch.tensor(1.0))
 
     trainer.step = step  # type: ignore[method-assign]
@@ -179,10 +180,10 @@ def test_a_training_ends_with_its_budget(tiny_scene: Path, tmp_path: Path) -> No
     trainer = trainer_of(
         tiny_scene, preset_of("training.budget=0.5s", "training.steps=10000", motion="static")
     )
-    told: list[Report] = []
-    assert train(trainer, run_of(trainer, tmp_path / "run"), told.append)
+    reports: list[Report] = []
+    assert train(trainer, run_of(trainer, tmp_path / "run"), reports.append)
     assert trainer.clock.progress == 1 and 0.5 <= trainer.clock.elapsed < 30
-    assert 1 < told[-1].step <= trainer.clock.step < 10_000  # which is where steps would end it
+    assert 1 < reports[-1].step <= trainer.clock.step < 10_000  # which is where steps would end it
 
 
 def test_ctrl_c_ends_after_the_step_and_saves(
@@ -255,7 +256,7 @@ def test_an_error_leaves_the_last_checkpoint(
 
 
 def test_time_left_follows_from_the_pace() -> None:
-    report = Report(10, 30.0, 0.25, 0.1, 5, 1.0, 0.0, 3.0, 20.0, "val", {})
+    report = Report(10, 30.0, 0.25, 0.1, 5, 1.0, 0.0, 0, 3.0, 20.0, "val", {})
     assert report.remaining == pytest.approx(90.0)
     assert math.isfinite(replace(report, progress=0.0).remaining)
     assert replace(report, progress=1.0).remaining == 0

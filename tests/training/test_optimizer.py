@@ -11,16 +11,9 @@ from hypothesis import strategies as st
 from kernel_checks import assert_same_on_threads, generator
 from torch import Tensor
 
-from gsdmsr_cli.training.optimizer import (
-    BETA1,
-    BETA2,
-    EPS,
-    Adam,
-    Gate,
-    Move,
-    adam_steps,
-    adam_steps_twin,
-)
+from gsdmsr_cli.ops.adam import Gate, Move, adam_steps, adam_steps_twin
+from gsdmsr_cli.ops.adam.moves import BETA1, BETA2, EPS
+from gsdmsr_cli.training.optimizer import Adam
 
 SHAPES = [(1,), (16,), (7, 3), (33, 4, 3), (5, 4), (100,)]
 STEPS = 6
@@ -175,7 +168,8 @@ def trained_adam() -> Adam:
 def test_take_follows_the_parents_and_fresh_rows_have_no_moments() -> None:
     optimizer, before = trained_adam(), trained_adam()
     rows, fresh = torch.tensor([2, 0, 2, 3, 3]), torch.tensor([False, False, True, True, False])
-    optimizer.take(["splats", "never trained"], rows, fresh)
+    for name in ("splats", "never trained"):
+        optimizer.take(name, rows, fresh)
     for now, old in ((optimizer.first, before.first), (optimizer.second, before.second)):
         assert torch.equal(now["splats"][~fresh], old["splats"][rows[~fresh]])
         assert not now["splats"][fresh].any()
@@ -184,25 +178,57 @@ def test_take_follows_the_parents_and_fresh_rows_have_no_moments() -> None:
     assert optimizer.steps == before.steps
 
 
-def test_calm_takes_the_momentum_of_some_rows() -> None:
+def test_momentum_is_reset_in_some_rows() -> None:
     optimizer, before = trained_adam(), trained_adam()
     rows = torch.tensor([True, False, False, True])
-    optimizer.calm(["splats", "never trained"], rows)
+    for name in ("splats", "never trained"):
+        optimizer.reset_momentum(name, rows)
     assert not optimizer.first["splats"][rows].any()
     assert torch.equal(optimizer.first["splats"][~rows], before.first["splats"][~rows])
     assert torch.equal(optimizer.second["splats"], before.second["splats"])
     assert torch.equal(optimizer.first["field"], before.first["field"])
 
 
-def test_forget_clears_one_tensor() -> None:
+def test_moments_of_one_tensor_are_reset() -> None:
     optimizer, before = trained_adam(), trained_adam()
-    optimizer.forget("splats", second=False)
+    optimizer.reset_moments("splats", second=False)
     assert not optimizer.first["splats"].any()
     assert torch.equal(optimizer.second["splats"], before.second["splats"])
-    optimizer.forget("splats")
-    optimizer.forget("never trained")
+    optimizer.reset_moments("splats")
+    optimizer.reset_moments("never trained")
     assert not optimizer.second["splats"].any()
     assert torch.equal(optimizer.first["field"], before.first["field"])
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("second", [True, False])
+def test_a_forgotten_moment_counts_its_steps_anew(second: bool, dtype: torch.dtype) -> None:
+    """With both reset, the first step is the rate long, as any first step (closed form).
+
+    With the first alone it is rate * g / sqrt(v), v the corrected second moment: constant
+    gradients, whose mean square is their square, make that the rate again.
+    """
+    tensor, optimizer = torch.zeros(3, dtype=dtype, requires_grad=True), Adam()
+    gradient = torch.tensor([2.0, -3.0, 1e-4], dtype=dtype)
+    for _ in range(30):
+        tensor.grad = gradient.clone()
+        optimizer.step({"x": tensor}, {"x": 0.1})
+    optimizer.reset_moments("x", second)
+    rate, later = 0.1, gradient * (0.25 if second else 1.0)
+    for _ in range(3):
+        before, tensor.grad = tensor.detach().clone(), later.clone()
+        optimizer.step({"x": tensor}, {"x": rate})
+        expected = -rate * gradient.sign()
+        torch.testing.assert_close(tensor.detach() - before, expected, rtol=1e-4, atol=0)
+
+
+def test_a_first_moment_that_is_forgotten_twice_counts_from_the_last_time() -> None:
+    optimizer = trained_adam()
+    optimizer.reset_moments("splats", second=False)
+    assert optimizer.steps["splats"] == optimizer.restarts["splats"] == 1
+    optimizer.reset_moments("splats")
+    assert optimizer.steps["splats"] == optimizer.restarts["splats"] == 0
+    assert optimizer.steps["field"] == 1 and "field" not in optimizer.restarts
 
 
 @pytest.mark.parametrize("rows", [False, True])

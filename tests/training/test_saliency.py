@@ -23,9 +23,10 @@ from training_checks import (
     trainer_of,
 )
 
-from gsdmsr_cli.geometry import SH_C0
-from gsdmsr_cli.preset import SaliencyOptions
-from gsdmsr_cli.splats import Splats
+from gsdmsr_cli.gaussians.splats import Splats
+from gsdmsr_cli.ground.geometry import SH_C0
+from gsdmsr_cli.options.preset import SaliencyOptions
+from gsdmsr_cli.training.rates import learning_rates
 from gsdmsr_cli.training.saliency import SPARSE_EVERY, Saliency, step_saliency
 from gsdmsr_cli.training.trainer import Trainer
 
@@ -109,10 +110,10 @@ def test_a_class_is_held() -> None:
     assert found == [True, True, True, False, False, False, False, True, True]
 
 
-def test_new_splats_have_grace_and_so_have_pardoned_ones() -> None:
+def test_new_splats_have_grace_and_so_have_restarted_ones() -> None:
     saliency = saliency_of(threshold=1.0, grace=2)
     assert classes(saliency, [0.0, 0.0]) == [True, False]
-    saliency.pardon(ALL)
+    saliency.restart(ALL)
     assert bool(saliency.high)
     assert classes(saliency, [0.0, 0.0]) == [True, False]
     saliency.take(torch.tensor([0, 0]), torch.tensor([False, True]))
@@ -148,10 +149,10 @@ def test_what_low_splats_may_do(gate: str, factors: list[float]) -> None:
         assert saliency.multipliers(step).tolist() == [1.0, factor]
 
 
-def test_low_splats_teach_the_field_now_and_then() -> None:
+def test_fields_learn_from_low_splats_now_and_then() -> None:
     saliency = saliency_of(2, field_every=3)
     saliency.high = torch.tensor([True, False])
-    found = [saliency.teachers(step) for step in range(4)]
+    found = [saliency.gradient_mask(step) for step in range(4)]
     assert found[0] is None and found[3] is None
     assert found[1] is saliency.high and found[2] is saliency.high
 
@@ -225,7 +226,10 @@ def test_a_gate_that_never_closes_changes_nothing(tiny_scene: Path, gate: str) -
     """
     open_gate = after(gated(tiny_scene, f"saliency.gate={gate}", "saliency.threshold=1e-12"), 25)
     none = after(gated(tiny_scene), 25)
-    rates = none._rates(1.0)
+    rates = learning_rates(
+        none.model.parameters(), none.preset.optimizer, 1.0, none.preset.training.static_until,
+        none.scene.radius,
+    )  # fmt: skip
     for name, tensor in none.model.tensors().items():
         torch.testing.assert_close(
             open_gate.model.tensors()[name], tensor, atol=0.01 * rates[name], rtol=1e-5
@@ -239,7 +243,7 @@ def test_nothing_is_gated_before_its_time(tiny_scene: Path) -> None:
     assert torch.equal(~trainer.saliency.high, judged(trainer)) and judged(trainer).any()
 
 
-def test_the_reset_of_opacities_pardons_all(tiny_scene: Path) -> None:
+def test_the_reset_of_opacities_restarts_all(tiny_scene: Path) -> None:
     trainer = gated(tiny_scene, "saliency.gate=freeze", NEVER_HIGH, "saliency.grace=4")
     after(trainer, 16)
     assert not trainer.saliency.high.all()
@@ -253,7 +257,7 @@ def test_the_reset_of_opacities_pardons_all(tiny_scene: Path) -> None:
 def test_a_resumed_training_is_gated_as_if_never_interrupted(
     tiny_scene: Path, tmp_path: Path, gate: str, stop: int
 ) -> None:
-    """With splats in both classes, some standing still, and a field that some do not teach."""
+    """With splats in both classes, some standing still, and some that fields do not learn from."""
     options = (
         f"saliency.gate={gate}", "saliency.threshold=1.5e-4", "saliency.field_every=2", *SETTLING
     )  # fmt: skip

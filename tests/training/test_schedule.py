@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gsdmsr_cli.preset import TrainingOptions
+from gsdmsr_cli.options.preset import TrainingOptions
 from gsdmsr_cli.training import schedule
 from gsdmsr_cli.training.schedule import Clock, log_linear, new_clock
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,7 @@ from typing import Any
 import pytest
 import torch
 from kernel_checks import assert_same_on_threads
-from motion_checks import are_among
+from motion_checks import are_among, splats_at
 from torch import Tensor
 from training_checks import (
     SETTLING,
@@ -23,15 +24,18 @@ from training_checks import (
     trainer_of,
 )
 
-from gsdmsr_cli import motion as motions
-from gsdmsr_cli import plugins
-from gsdmsr_cli.errors import GsdmsrError
-from gsdmsr_cli.frame import Frame
+from gsdmsr_cli.gaussians.frame import Frame
+from gsdmsr_cli.gaussians.moment import Moment
+from gsdmsr_cli.gaussians.splats import Splats
+from gsdmsr_cli.ground import plugins
+from gsdmsr_cli.ground.errors import GsdmsrError
+from gsdmsr_cli.model import motion as motions
 from gsdmsr_cli.raster import best_engine
-from gsdmsr_cli.splats import Splats
-from gsdmsr_cli.training import initial, look
-from gsdmsr_cli.training import trainer as trainer_module
-from gsdmsr_cli.training.density import grow_and_prune
+from gsdmsr_cli.runs import earlier
+from gsdmsr_cli.training.gradients import compare
+from gsdmsr_cli.training.population import density
+from gsdmsr_cli.training.population.density import grow_and_prune
+from gsdmsr_cli.training.starting import initial
 from gsdmsr_cli.training.trainer import PATIENCE, Trainer
 
 every_motion = pytest.mark.parametrize("motion", plugins.names(motions.__name__))
@@ -39,7 +43,7 @@ every_motion = pytest.mark.parametrize("motion", plugins.names(motions.__name__)
 SPLATS = ("means", "quats", "log_scales", "logit_opacities", "sh")
 
 
-class Witness:
+class RecordingEngine:
     """An engine that remembers what it was asked to draw."""
 
     def __init__(self) -> None:
@@ -50,11 +54,11 @@ class Witness:
     def unavailable(self, device: str) -> str | None:
         return None
 
-    def rasterize(self, splats: Splats, camera: Any, background: Any, *rest: Any) -> Frame:
-        self.splats.append(splats.map(lambda t: t.detach().clone()))
+    def rasterize(self, moment: Moment, camera: Any, background: Any, *rest: Any) -> Frame:
+        self.splats.append(moment.splats.map(lambda t: t.detach().clone()))
         self.sizes.append((camera.width, camera.height))
         self.degrees.append(rest[0])
-        return best_engine("cpu").rasterize(splats, camera, background, *rest)
+        return best_engine("cpu").rasterize(moment, camera, background, *rest)
 
 
 def after(trainer: Trainer, steps: int) -> list[float]:
@@ -105,6 +109,24 @@ def test_a_resumed_training_goes_on_as_if_never_interrupted(
     assert_same_tensors(state_of(second), end)
 
 
+def test_a_checkpoint_of_the_version_before_is_gone_on_with(
+    tiny_scene: Path, uninterrupted: Any
+) -> None:
+    """It counted rounds of growth, resets and thinnings in the state itself; the first had none."""
+    losses, end = uninterrupted["multiscale"]
+    first, second = (trainer_of(tiny_scene, preset_of()) for _ in range(2))
+    after(first, 17)
+    made = first.checkpoint()
+    state = {key: value for key, value in made.state.items() if key not in ("events", "dropped")}
+    events = made.state["events"]
+    state["rounds"], state["resets"] = events["density"]["rounds"], events["opacity_reset"]["count"]
+    assert state["rounds"] > 0 and state["resets"] == 1
+    state = earlier.present_state(state, "multiscale")
+    second.restore(replace(made, state=state, tensors=copies(made.tensors)))
+    assert after(second, STEPS - 17) == losses[17:]
+    assert_same_tensors(state_of(second), end)
+
+
 def test_the_training_that_is_resumed_has_grown_and_moved(uninterrupted: Any) -> None:
     """So that the test above compares something."""
     for motion, (losses, end) in uninterrupted.items():
@@ -141,14 +163,14 @@ def test_training_does_not_depend_on_the_number_of_threads(tiny_scene: Path, mot
 
 @pytest.mark.parametrize("motion", ["hexplane", "multiscale"])
 def test_nothing_moves_in_the_static_phase(tiny_scene: Path, motion: str) -> None:
-    witness = Witness()
+    engine = RecordingEngine()
     options = ["training.static_until=0.25", "density.start=999"]
-    trainer = trainer_of(tiny_scene, preset_of(*options, motion=motion), witness)
+    trainer = trainer_of(tiny_scene, preset_of(*options, motion=motion), engine)
     start = copies(trainer.model.tensors())
     for _ in range(STEPS // 4):
         still = trainer.model.splats.means.detach().clone()
         trainer.step()
-        assert torch.equal(witness.splats[-1].means, still)
+        assert torch.equal(engine.splats[-1].means, still)
     for name, tensor in trainer.model.tensors().items():
         assert torch.equal(tensor, start[name]) == name.startswith("motion."), name
     after(trainer, 4)
@@ -158,7 +180,7 @@ def test_nothing_moves_in_the_static_phase(tiny_scene: Path, motion: str) -> Non
         if name.startswith("motion.") and not torch.equal(tensor, start[name])
     ]
     assert changed
-    moved = [trainer.model.at(time).means for time in (0.0, 0.5)]
+    moved = [splats_at(trainer.model, time).means for time in (0.0, 0.5)]
     assert not torch.equal(*moved)
 
 
@@ -179,45 +201,45 @@ def test_the_motion_starts_without_the_momentum_of_the_static_phase(tiny_scene: 
     trainer = trainer_of(tiny_scene, preset_of(*options))
     after(trainer, STEPS // 4)
     assert trainer.optimizer.first["splats.means"].any()
-    forgotten: list[tuple[str, bool]] = []
-    forget = trainer.optimizer.forget
+    reset: list[tuple[str, bool]] = []
+    reset_moments = trainer.optimizer.reset_moments
 
     def remember(name: str, second: bool = True) -> None:
-        forgotten.append((name, second))
-        forget(name, second)
+        reset.append((name, second))
+        reset_moments(name, second)
 
-    trainer.optimizer.forget = remember  # type: ignore[method-assign]
+    trainer.optimizer.reset_moments = remember  # type: ignore[method-assign]
     after(trainer, 3)
     # the second moments, which say how large a step may be, stay
-    assert forgotten == [(f"splats.{name}", False) for name in SPLATS]
+    assert reset == [(f"splats.{name}", False) for name in SPLATS]
 
 
-def test_a_motion_is_rooted_as_it_begins_and_after_every_growth(tiny_scene: Path) -> None:
+def test_a_motion_is_anchored_anew_as_it_begins_and_after_every_growth(tiny_scene: Path) -> None:
     options = ["training.static_until=0.25", "density.gradient=1e-9", "density.reset_at=[]"]
-    trainer = trainer_of(tiny_scene, preset_of(*options, motion="nodes"))
-    rooted: list[tuple[int, int]] = []
-    root = trainer.model.root
+    trainer = trainer_of(tiny_scene, preset_of(*options, motion="control_points"))
+    anchored: list[tuple[int, int]] = []
+    reanchor = trainer.model.reanchor
 
     def remember() -> list[str]:
-        names = root()
-        nodes = trainer.model.tensors()["motion.nodes"]
+        names = reanchor()
+        points = trainer.model.tensors()["motion.control_points"]
         means = trainer.model.splats.means
-        assert are_among(nodes, means)
-        rooted.append((trainer.clock.step, len(means)))
+        assert are_among(points, means)
+        anchored.append((trainer.clock.step, len(means)))
         return names
 
-    trainer.model.root = remember  # type: ignore[method-assign]
+    trainer.model.reanchor = remember  # type: ignore[method-assign]
     counts = []
     for step in range(STEPS):
         counts.append(len(trainer.model.splats))
         trainer.step()
-        if (step + 1, len(trainer.model.splats)) in rooted:
+        if (step + 1, len(trainer.model.splats)) in anchored:
             for moments in (trainer.optimizer.first, trainer.optimizer.second):
-                assert not moments["motion.nodes"].any()
+                assert not moments["motion.control_points"].any()
     grown = [(step, n) for step, (o, n) in enumerate(pairwise(counts), start=1) if n > o]
     first = STEPS // 4
-    assert rooted[0] == (first, counts[first])
-    assert len(rooted) > 1 and rooted[1:] == [(step, n) for step, n in grown if step > first]
+    assert anchored[0] == (first, counts[first])
+    assert len(anchored) > 1 and anchored[1:] == [(step, n) for step, n in grown if step > first]
 
 
 @pytest.mark.parametrize(("steps", "every"), [(40, 1), (40, 2), (120, 2), (40, 5)])
@@ -232,7 +254,7 @@ def test_a_longer_training_grows_no_more_often(
             grown.append(trainer.clock.step)
         return grow_and_prune(*arguments)
 
-    monkeypatch.setattr(trainer_module, "grow_and_prune", remember)
+    monkeypatch.setattr(density, "grow_and_prune", remember)
     options = (f"training.steps={steps}", f"density.every={every}", "density.start=0")
     preset = preset_of(*options, "density.rounds=6", "density.until=0.5", "density.reset_at=[]")
     trainer = trainer_of(tiny_scene, preset)
@@ -257,13 +279,13 @@ def test_the_motion_is_told_where_the_first_splats_are(tiny_scene: Path) -> None
 def test_every_view_is_seen_before_any_again(tiny_scene: Path) -> None:
     preset = preset_of("training.low_resolution_until=0")
     trainer, seen = trainer_of(tiny_scene, preset), []
-    load = trainer.observer.pictures.load
+    load = trainer.renderer.pictures.load
 
     def remember(view: Any) -> Tensor:
         seen.append(view.name)
         return load(view)
 
-    trainer.observer.pictures.load = remember  # type: ignore[method-assign]
+    trainer.renderer.pictures.load = remember  # type: ignore[method-assign]
     after(trainer, 36)
     rounds = [seen[i : i + 12] for i in (0, 12, 24)]
     for names in rounds:
@@ -284,7 +306,7 @@ def test_splats_that_hardly_move_are_let_stand_still(tiny_scene: Path) -> None:
     moving = trainer.model.moving
     assert len(trainer.optimizer.first["motion.embeddings"]) == moving
     assert len(trainer.optimizer.first["splats.means"]) == len(trainer.model.splats)
-    first, last = trainer.model.at(0.0).means, trainer.model.at(1.0).means
+    first, last = splats_at(trainer.model, 0.0).means, splats_at(trainer.model, 1.0).means
     still = torch.arange(len(first)) >= moving
     assert torch.equal((first == last).all(dim=1), still)
 
@@ -312,54 +334,76 @@ def test_a_training_with_still_splats_is_resumed_as_if_never_interrupted(
         assert_same_tensors(state_of(second), state_of(whole))
         model, _ = run.load_model()
         assert model.moving == first.model.moving
-        assert torch.equal(model.at(0.3).means, first.result().at(0.3).means)
+        assert torch.equal(splats_at(model, 0.3).means, splats_at(first.result(), 0.3).means)
+
+
+def test_a_training_with_still_splats_can_be_lengthened(tiny_scene: Path, tmp_path: Path) -> None:
+    """Progress goes back to where splats grow; clones and children stand still as parents do."""
+    first = trainer_of(tiny_scene, preset_of(*SETTLING))
+    after(first, STEPS)
+    still = len(first.model.splats) - first.model.moving
+    assert still > 0
+    run = run_of(first, tmp_path / "run")
+    run.save(first.checkpoint())
+    longer = f"training.steps={4 * STEPS}", "density.gradient=1e-12", "density.cap=1000"
+    second = trainer_of(tiny_scene, preset_of(*SETTLING, *longer))
+    second.restore(run.load())
+    after(second, STEPS // 2)
+    model = second.model
+    assert len(model.splats) - model.moving > still
+    assert len(second.optimizer.first["motion.embeddings"]) == model.moving
+    at_ends = [splats_at(model, time).means for time in (0.0, 1.0)]
+    still_rows = torch.arange(len(model.splats)) >= model.moving
+    assert torch.equal((at_ends[0] == at_ends[1]).all(dim=1), still_rows)
 
 
 def test_several_views_a_step_are_averaged(tiny_scene: Path) -> None:
-    witness = Witness()
-    trainer = trainer_of(tiny_scene, preset_of("training.views_per_step=3"), witness)
+    engine = RecordingEngine()
+    trainer = trainer_of(tiny_scene, preset_of("training.views_per_step=3"), engine)
     after(trainer, 2)
-    assert len(witness.splats) == 6 and trainer.clock.step == 2
+    assert len(engine.splats) == 6 and trainer.clock.step == 2
     assert trainer.optimizer.steps["splats.means"] == 2
 
 
 def test_pictures_are_small_at_first_where_asked_for(tiny_scene: Path) -> None:
-    witness = Witness()
+    engine = RecordingEngine()
     preset = preset_of("training.low_resolution_until=0.5", "data.downscale=2")
-    after(trainer_of(tiny_scene, preset, witness), STEPS)
-    assert witness.sizes == [(12, 12)] * (STEPS // 2) + [(24, 24)] * (STEPS // 2)
+    after(trainer_of(tiny_scene, preset, engine), STEPS)
+    assert engine.sizes == [(12, 12)] * (STEPS // 2) + [(24, 24)] * (STEPS // 2)
 
 
 def test_ssim_counts_up_to_its_end(tiny_scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    weights, true = [], look.photometric_loss
+    weights, true = [], compare.photometric_loss
 
     def remember(rgb: Tensor, target: Tensor, ssim_weight: float) -> Tensor:
         weights.append(ssim_weight)
         return true(rgb, target, ssim_weight)
 
-    monkeypatch.setattr(look, "photometric_loss", remember)
+    monkeypatch.setattr(compare, "photometric_loss", remember)
     after(
-        trainer_of(tiny_scene, preset_of("losses.ssim=0.4", "losses.ssim_until=0.25"), Witness()),
+        trainer_of(
+            tiny_scene, preset_of("losses.ssim=0.4", "losses.ssim_until=0.25"), RecordingEngine()
+        ),
         STEPS,
     )
     assert weights == [0.4] * (STEPS // 4) + [0.0] * (STEPS - STEPS // 4)
 
 
 def test_higher_degrees_of_colour_join_later(tiny_scene: Path) -> None:
-    witness = Witness()
+    engine = RecordingEngine()
     preset = preset_of("splats.sh_degree=2", "splats.sh_start=0.25")
-    after(trainer_of(tiny_scene, preset, witness), STEPS)
-    assert witness.degrees == [0] * 10 + [1] * 10 + [2] * 20
+    after(trainer_of(tiny_scene, preset, engine), STEPS)
+    assert engine.degrees == [0] * 10 + [1] * 10 + [2] * 20
 
 
 def test_splats_grow_up_to_the_cap_and_opacities_are_reset(tiny_scene: Path) -> None:
-    witness = Witness()
+    engine = RecordingEngine()
     options = ["density.reset_at=[0.5]", "density.until=0.4", "density.prune_opacity=0"]
-    after(trainer_of(tiny_scene, preset_of(*options), witness), STEPS)
-    counts = [len(splats) for splats in witness.splats]
+    after(trainer_of(tiny_scene, preset_of(*options), engine), STEPS)
+    counts = [len(splats) for splats in engine.splats]
     assert counts[:6] == [120] * 6 and counts[6] > 120  # drawn after six steps
     assert max(counts) == counts[-1] == 200
-    opacity = [float(torch.sigmoid(splats.logit_opacities).max()) for splats in witness.splats]
+    opacity = [float(torch.sigmoid(splats.logit_opacities).max()) for splats in engine.splats]
     lowest = STEPS // 2 + 1  # drawn after the step that began at 0.5
     assert opacity[lowest - 1] > 0.1 and opacity[lowest] <= 0.01 + 1e-6
     assert opacity.count(opacity[lowest]) == 1
@@ -372,12 +416,12 @@ def test_a_training_without_splats_gives_up(tiny_scene: Path) -> None:
 
 
 class Losses:
-    """Loss functions that are not finite when told so; a Witness asks them."""
+    """Loss functions that are not finite when told so; a RecordingEngine asks them."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.factor = 1.0
-        self.true = look.photometric_loss
-        monkeypatch.setattr(look, "photometric_loss", self)
+        self.true = compare.photometric_loss
+        monkeypatch.setattr(compare, "photometric_loss", self)
 
     def __call__(self, *arguments: Any) -> Tensor:
         return self.true(*arguments) * self.factor
@@ -392,7 +436,7 @@ def losses(monkeypatch: pytest.MonkeyPatch) -> Losses:
 def test_a_step_without_a_finite_loss_changes_nothing(
     tiny_scene: Path, losses: Losses, factor: float
 ) -> None:
-    trainer = trainer_of(tiny_scene, preset_of(), Witness())
+    trainer = trainer_of(tiny_scene, preset_of(), RecordingEngine())
     after(trainer, 8)
     before = state_of(trainer)
     del before["generator"]
@@ -411,7 +455,7 @@ def test_training_gives_up_after_many_losses_in_a_row_that_are_not_finite(
     tiny_scene: Path, losses: Losses
 ) -> None:
     preset = preset_of("training.steps=1000", "density.start=999")
-    trainer = trainer_of(tiny_scene, preset, Witness())
+    trainer = trainer_of(tiny_scene, preset, RecordingEngine())
     losses.factor = math.nan
     after(trainer, PATIENCE - 1)
     losses.factor = 1.0

@@ -15,23 +15,27 @@ from gsdmsr_cli.raster import best_engine
 from gsdmsr_cli.training.warm_up import warm_up, warm_up_motion
 
 IN_A_NEW_PROCESS = """
-import importlib, json, pkgutil, sys
+import importlib, json, sys
 from pathlib import Path
-from gsdmsr_cli import kernels
+import gsdmsr_cli
+from gsdmsr_cli.backends.cpu.jit import sources
 from gsdmsr_cli.formats import read_scene
-from gsdmsr_cli.pictures import Pictures
-from gsdmsr_cli.preset import load_preset
+from gsdmsr_cli.scene.pictures import Pictures
+from gsdmsr_cli.options.preset import load_preset
 from gsdmsr_cli.raster import best_engine
 from gsdmsr_cli.training.trainer import Trainer
 from gsdmsr_cli.training.warm_up import warm_up, warm_up_motion
 
 def compiled():
     found = {}
-    for module in pkgutil.iter_modules(kernels.__path__):
-        loaded = importlib.import_module(f"{kernels.__name__}.{module.name}")
-        for name, value in vars(loaded).items():
+    package = Path(gsdmsr_cli.__file__).parent
+    for path in sources():
+        if path.name.startswith("__"):
+            continue
+        module = ".".join(path.relative_to(package.parent).with_suffix("").parts)
+        for name, value in vars(importlib.import_module(module)).items():
             if hasattr(value, "overloads"):
-                found[f"{module.name}.{name}"] = len(value.overloads)
+                found[f"{module}.{name}".removeprefix("gsdmsr_cli.ops.")] = len(value.overloads)
     return found
 
 scene, options = read_scene(Path(sys.argv[1])), json.loads(sys.argv[2])
@@ -48,16 +52,16 @@ print(json.dumps(stages))
 """
 
 
-@pytest.mark.parametrize("motion", ["multiscale", "hexplane", "nodes"])
+@pytest.mark.parametrize("motion", ["multiscale", "hexplane", "control_points"])
 def test_training_needs_no_kernel_that_was_not_warmed_up(tiny_scene: Path, motion: str) -> None:
     options = json.dumps([*OPTIONS, f"motion={{name: {motion}}}"])
     command = [sys.executable, "-c", IN_A_NEW_PROCESS, str(tiny_scene), options, str(STEPS)]
     ended = subprocess.run(command, capture_output=True, text=True, check=True)
     by_motion, by_all, trained = json.loads(ended.stdout)
     assert trained == by_all
-    for kernel in ("planes.lookup", "planes.lookup_backward", "network.forward"):
+    for kernel in ("planes.cpu.lookup", "planes.cpu.lookup_backward", "network.cpu.forward"):
         assert by_motion[kernel] == by_all[kernel] > 0
-    assert by_motion["looking.look"] == 0 < by_all["looking.look"]
+    assert by_motion["rasterize.cpu.fused.look"] == 0 < by_all["rasterize.cpu.fused.look"]
 
 
 @pytest.mark.parametrize("warm", [warm_up, warm_up_motion])

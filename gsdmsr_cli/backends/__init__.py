@@ -1,0 +1,1 @@
+"""Compiles and runs kernels on the CPU and on GPUs, whatever they compute."""

@@ -1,0 +1,1 @@
+"""Compiles Numba kernels, and gives them vectors of 16 floats."""

@@ -1,0 +1,227 @@
+"""How every kernel is compiled: options, threads, and an on-disk cache that notices edits.
+
+A kernel that is not in the cache is compiled by a process of its own, which starts for nothing
+else, and is then read from there. A process that compiles a kernel itself can get other code than
+one that reads it, which rounds otherwise: so a training's results would depend on what had been
+trained before.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import hashlib
+import importlib
+import os
+import pickle
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from importlib import metadata
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from gsdmsr_cli.ground.machine import cache_home
+
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None  # type: ignore[assignment]
+
+HERE = Path(__file__).parent
+PACKAGE = HERE.parents[1]
+
+
+def sources() -> list[Path]:
+    """Return all files that kernels are compiled from: their own, and the constants."""
+    ops = PACKAGE / "ops"
+    kernels = [*ops.glob("*/cpu.py"), *ops.glob("*/cpu/*.py"), *HERE.glob("*.py")]
+    constants = [PACKAGE / "ground" / name for name in ("splatting_constants.py", "ssim.py")]
+    return [*sorted(kernels), *constants]
+
+
+def _sources_hash() -> str:
+    digest = hashlib.sha256()
+    for path in sources():
+        digest.update(path.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+def _cache_folder() -> Path:
+    """Folder of compiled kernels: beside the sources if that is writable, else the user's cache.
+
+    Numba alone would not recompile a kernel when a helper in another module changes, so the
+    folder's name is a hash of all kernel sources and of the constants compiled into them.
+    """
+    beside = HERE / "__pycache__"
+    try:
+        beside.mkdir(exist_ok=True)
+        writable = os.access(beside, os.W_OK)
+    except OSError:
+        writable = False
+    if writable:
+        return beside / _sources_hash()
+    return cache_home() / _sources_hash()
+
+
+def _keep_large_blocks_in_the_heap() -> None:
+    """Stop glibc from returning large freed blocks to the system.
+
+    A fresh picture-sized buffer otherwise costs its page faults (about 1.4 GB/s) every step. Other
+    C libraries are left alone.
+    """
+    if not sys.platform.startswith("linux"):
+        return
+    mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
+    if mallopt is not None:
+        m_trim_threshold, m_mmap_max = -1, -4
+        mallopt(m_mmap_max, 0)
+        mallopt(m_trim_threshold, 2**31 - 1)
+
+
+def _load_tbb() -> None:
+    """Load the threading library that pip installed, which the system's loader does not find.
+
+    Numba prefers it where it is. Its threads spin briefly, yield and then sleep, which suits many
+    short kernels both on an idle machine and on a busy one; OpenMP's can only do one or the other.
+    """
+    try:
+        files = metadata.distribution("tbb").files or []
+        library = next(f.locate() for f in files if f.name in ("libtbb.so.12", "tbb12.dll"))
+        ctypes.CDLL(str(Path(str(library)).resolve()), mode=ctypes.RTLD_GLOBAL)
+    except (metadata.PackageNotFoundError, StopIteration, OSError):
+        return  # OpenMP serves, or Numba's own threads
+
+
+_keep_large_blocks_in_the_heap()
+_load_tbb()
+
+import numba  # noqa: E402  (finds TBB only if that is loaded by now)
+from numba.core.caching import FunctionCache  # noqa: E402
+
+# set in both places: Numba has read its environment already if anybody imported it before, and
+# reads it again when it changes
+numba.config.CACHE_DIR = os.environ.setdefault("NUMBA_CACHE_DIR", str(_cache_folder()))
+
+FLAGS = {"reassoc", "contract", "arcp", "nsz", "afn"}
+"""Floating-point liberties of all kernels. Not nnan and ninf: kernels test for non-finite input."""
+
+_OPTIONS: dict[str, Any] = {
+    "cache": True,
+    "fastmath": FLAGS,
+    "error_model": "numpy",
+    "boundscheck": False,
+    "nogil": True,
+}
+
+_COMPILE = "from gsdmsr_cli.backends.cpu import jit; jit.compile_one()"
+"""What a process that is to compile a kernel is started with."""
+
+_compiles_here: set[tuple[str, str]] = set()
+"""Module and name of the kernel that this process was started to compile."""
+
+
+class _Cache(FunctionCache):  # type: ignore[misc]
+    """Numba's cache on disk, which has what is missing compiled by another process."""
+
+    def load_overload(self, signature: Any, target: Any) -> Any:
+        """Return the compiled kernel, or None where this process has to compile it itself."""
+        found = super().load_overload(signature, target)
+        if found is not None or not self._can_be_imported():
+            return found
+        with self._locked():
+            found = super().load_overload(signature, target)  # it may have been compiled meanwhile
+            if found is None and _compile_apart(*self._kernel(), signature):
+                found = super().load_overload(signature, target)
+        return found
+
+    def _kernel(self) -> tuple[str, str]:
+        return self._py_func.__module__, self._py_func.__qualname__
+
+    def _can_be_imported(self) -> bool:
+        """Return whether the kernel has a name by which another process can compile it."""
+        module, name = self._kernel()
+        return name.isidentifier() and module != "__main__" and (module, name) not in _compiles_here
+
+    @contextmanager
+    def _locked(self) -> Iterator[None]:
+        """Let one process at a time add to the kernel's index, which Numba reads and writes."""
+        folder = Path(self.cache_path)
+        folder.mkdir(parents=True, exist_ok=True)
+        with (folder / f"{self._impl.filename_base}.lock").open("w") as file:
+            if fcntl is not None:
+                fcntl.flock(file, fcntl.LOCK_EX)
+            yield
+
+
+def _compile_apart(module: str, name: str, signature: Any) -> bool:
+    """Have another process compile a kernel into the cache; return whether it has."""
+    # seeded, since sets of names must not come in another order each time
+    environment = os.environ | {
+        "NUMBA_CACHE_DIR": str(numba.config.CACHE_DIR),
+        "PYTHONHASHSEED": "0",
+        "PYTHONPATH": os.pathsep.join(sys.path),
+    }
+    try:
+        done = subprocess.run(
+            [sys.executable, "-c", _COMPILE],
+            input=pickle.dumps((module, name, signature)),
+            env=environment,
+            capture_output=True,
+            check=False,
+        )
+    except OSError:
+        return False
+    return done.returncode == 0
+
+
+def compile_one() -> None:
+    """Compile the kernel that the standard input names; see ``_compile_apart``."""
+    for folder in (PACKAGE / "ops").iterdir():
+        if folder.is_dir():
+            # an operation's own module brings torch, which takes longer than most kernels
+            empty = ModuleType(f"{PACKAGE.name}.ops.{folder.name}")
+            empty.__path__ = [str(folder)]
+            sys.modules[empty.__name__] = empty
+    module, name, signature = pickle.load(sys.stdin.buffer)
+    _compiles_here.add((module, name))
+    getattr(importlib.import_module(module), name).compile(signature)
+
+
+def _kept(compiled: Any) -> Any:
+    """Give a kernel the cache whose misses are compiled apart."""
+    compiled._cache = _Cache(compiled.py_func)
+    return compiled
+
+
+def serial(kernel: Callable[..., Any]) -> Any:
+    """Compile a kernel that runs on one thread."""
+    return _kept(numba.njit(**_OPTIONS)(kernel))
+
+
+def parallel(kernel: Callable[..., Any]) -> Any:
+    """Compile a kernel whose prange loops run on all threads."""
+    return _kept(numba.njit(parallel=True, **_OPTIONS)(kernel))
+
+
+inline = numba.njit(inline="always", **{k: v for k, v in _OPTIONS.items() if k != "cache"})
+"""Compile a helper into the kernels that call it."""
+
+
+def set_threads(count: int) -> int:
+    """Let kernels use ``count`` threads, or all cores if 0; return how many they use."""
+    most = int(numba.config.NUMBA_NUM_THREADS)
+    used = min(count, most) if count > 0 else most
+    numba.set_num_threads(used)
+    return used
+
+
+def threads() -> int:
+    """Return the number of threads kernels use."""
+    return int(numba.get_num_threads())
+
+
+def may_fork() -> bool:
+    """Return whether kernels run in a forked process when they have threads in this one."""
+    return str(numba.threading_layer()) in ("tbb", "workqueue")

@@ -1,0 +1,1 @@
+"""Compiles kernels in CUDA C at run time and launches them on torch's tensors."""

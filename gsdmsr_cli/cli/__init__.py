@@ -1,0 +1,1 @@
+"""The command line: one file of options per command; `main` runs it."""

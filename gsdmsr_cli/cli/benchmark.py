@@ -1,0 +1,119 @@
+"""The options of `gsdmsr benchmark`, and the call of the command with them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+from gsdmsr_cli.cli.options import Background, Json
+from gsdmsr_cli.ground.errors import UsageError
+
+
+def register(app: typer.Typer) -> None:
+    """Add the group of commands."""
+    group = typer.Typer(help="Measure speed.", no_args_is_help=True)
+    group.command()(kernels)
+    group.command()(scenes)
+    group.command()(resume)
+    group.command()(still)
+    app.add_typer(group, name="benchmark")
+
+
+def kernels(
+    yardstick: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Folder of other kernels to compare with.")
+    ] = None,
+    device: Annotated[Literal["cpu", "cuda"], typer.Option(help="What to time.")] = "cpu",
+    as_json: Json = False,
+) -> None:
+    """Time drawing and a training step, forward and backward."""
+    from gsdmsr_cli.commands import benchmark_kernels as command
+
+    command.run(yardstick, device, as_json)
+
+
+def scenes(
+    folders: Annotated[list[Path], typer.Argument(metavar="SCENE...", help="Scene folders.")],
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder of the runs and the table.")],
+    preset: Annotated[
+        list[str] | None, typer.Option(metavar="NAME", help="Preset; repeatable.")
+    ] = None,
+    config: Annotated[
+        list[Path] | None,
+        typer.Option(metavar="F.yaml", help="File of options in place of a preset; repeatable."),
+    ] = None,
+    budget: Annotated[
+        list[str] | None, typer.Option(metavar="8m", help="Wall time of a training; repeatable.")
+    ] = None,
+    steps: Annotated[
+        list[int] | None, typer.Option(metavar="N", help="Steps of a training; repeatable.")
+    ] = None,
+    seed: Annotated[list[int] | None, typer.Option(metavar="N", help="Seed; repeatable.")] = None,
+    downscale: Annotated[
+        int, typer.Option(min=1, metavar="N", help="Divide both sides of pictures by N.")
+    ] = 1,
+    background: Annotated[
+        Background, typer.Option(help="Colour behind transparent pixels.")
+    ] = "white",
+    split: Annotated[Literal["test", "val"], typer.Option(help="Views to compare.")] = "test",
+    lpips_weights: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Folder of LPIPS weights.")
+    ] = None,
+    jobs: Annotated[
+        int,
+        typer.Option(min=1, metavar="N", help="Trials side by side, each on its share of cores."),
+    ] = 1,
+    as_json: Json = False,
+) -> None:
+    """Train presets on scenes at equal lengths and print the table of their scores."""
+    lengths: list[str | int] = [*(budget or []), *(steps or [])]
+    if not lengths:
+        raise UsageError("how long is a training? give --budget 8m or --steps N, or several")
+    from gsdmsr_cli.benchmark.trials import Terms
+    from gsdmsr_cli.commands import benchmark_scenes as command
+
+    terms = Terms(downscale, background, split, lpips_weights, jobs)
+    presets: list[str | Path] = [*(preset or []), *(config or [])]
+    command.run(folders, out, presets or ["dnerf"], lengths, seed or [0], terms, as_json)
+
+
+def resume(
+    folder: Annotated[Path, typer.Argument(metavar="SCENE", help="Scene folder.")],
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder of the runs.")],
+    preset: Annotated[str, typer.Option(metavar="NAME", help="Preset.")] = "dnerf",
+    steps: Annotated[int, typer.Option(min=1, metavar="N", help="Steps of a training.")] = 600,
+    downscale: Annotated[
+        int, typer.Option(min=1, metavar="N", help="Divide both sides of pictures by N.")
+    ] = 4,
+    kills: Annotated[int, typer.Option(min=1, metavar="N", help="Trainings to kill.")] = 20,
+    seed: Annotated[int, typer.Option(min=0, metavar="N", help="Seed of the moments.")] = 0,
+    overrides: Annotated[
+        list[str] | None, typer.Option("--set", metavar="a.b=v", help="One option; repeatable.")
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Kill trainings at random moments, resume them, and compare how they end."""
+    from gsdmsr_cli.commands import benchmark_resume as command
+
+    asked = [f"training.steps={steps}", f"data.downscale={downscale}", *(overrides or [])]
+    command.run(folder, out, preset, asked, kills, seed, as_json)
+
+
+def still(
+    run: Annotated[Path, typer.Argument(metavar="RUN", help="Run folder.")],
+    below: Annotated[
+        list[float] | None,
+        typer.Option(metavar="X", help="Motion saliency; repeatable. [default: 0.1 0.3 1 3]"),
+    ] = None,
+    split: Annotated[Literal["test", "val"], typer.Option(help="Views to compare.")] = "val",
+    data: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Where the data lies now, if elsewhere.")
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Let what hardly moves stand still, and measure PSNR and frames a second."""
+    from gsdmsr_cli.commands import benchmark_still as command
+
+    command.run(run, below or [0.1, 0.3, 1.0, 3.0], split, data, as_json)

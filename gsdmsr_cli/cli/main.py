@@ -1,0 +1,153 @@
+"""Runs the command line and turns errors and signals into one line and an exit code."""
+
+from __future__ import annotations
+
+import errno
+import os
+import signal
+import sys
+import threading
+import traceback
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import FrameType
+from typing import Annotated, cast
+
+import typer
+
+from gsdmsr_cli import __version__
+from gsdmsr_cli.cli import (
+    benchmark,
+    demo,
+    doctor,
+    export,
+    prepare,
+    render,
+    train,
+    weights,
+)
+from gsdmsr_cli.cli import eval as evaluate
+from gsdmsr_cli.ground.errors import GsdmsrError, UsageError
+
+# These files import gsdmsr_cli.commands in the functions that run them: torch alone would make
+# --help slow.
+_COMMANDS = (prepare, train, evaluate, render, export, demo, doctor, weights, benchmark)
+"""In the order of --help."""
+
+app = typer.Typer(
+    help="Dynamic 3D Gaussian splatting: train, render, measure and export.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+for _command in _COMMANDS:
+    _command.register(app)
+
+# What the machine, not the program, is to blame for when a file cannot be read or written.
+_MACHINE_ERRNOS = frozenset(
+    {
+        errno.ENOSPC,
+        errno.EDQUOT,
+        errno.EFBIG,
+        errno.EROFS,
+        errno.EACCES,
+        errno.EPERM,
+        errno.EIO,
+        errno.EMFILE,
+        errno.ENAMETOOLONG,
+        errno.ENOTDIR,
+        errno.EISDIR,
+    }
+)
+
+
+def _version(value: bool) -> None:
+    if value:
+        typer.echo(f"gsdmsr {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _common(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")
+    ] = False,
+) -> None:
+    pass
+
+
+# The command-line errors of typer share this base, which typer does not export by name.
+_CommandLineError = cast(type[typer.BadParameter], typer.BadParameter.__base__)
+
+
+def main() -> None:
+    """Run the command line and exit: 0 ok, 1 internal, 2 usage, 3 data, 4 threshold, 130 Ctrl-C."""
+    sys.exit(_run())
+
+
+def _run() -> int:
+    try:
+        with ctrl_c_that_spares_imports():
+            result = typer.main.get_command(app).main(prog_name="gsdmsr", standalone_mode=False)
+    except (KeyboardInterrupt, typer.Abort):
+        return 130
+    except BrokenPipeError:
+        # the reader of our output has left, as in `gsdmsr doctor | head -1`; keep Python's own
+        # flush at exit from failing on the same pipe
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+    except Exception as error:
+        if os.environ.get("GSDMSR_DEBUG"):
+            traceback.print_exc()
+        message, code = _explain(error)
+        typer.echo(f"error: {' '.join(message.split())}", err=True)
+        return code
+    return result if isinstance(result, int) else 0
+
+
+@contextmanager
+def ctrl_c_that_spares_imports() -> Iterator[None]:
+    """Let Ctrl-C raise KeyboardInterrupt, but not in an import: the core of torch would abort.
+
+    SIGTERM, by which containers and schedulers end a process, does what Ctrl-C does at the time.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield  # where Python allows no handlers
+        return
+    before = signal.signal(signal.SIGINT, _interrupt), signal.signal(signal.SIGTERM, _terminate)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before[0])
+        signal.signal(signal.SIGTERM, before[1])
+
+
+def _terminate(_number: int, _frame: FrameType | None) -> None:
+    signal.raise_signal(signal.SIGINT)
+
+
+def _interrupt(_number: int, frame: FrameType | None) -> None:
+    while frame is not None:
+        if frame.f_globals.get("__name__") == "importlib._bootstrap":
+            os._exit(130)  # nothing has been begun that would have to be cleared away
+        frame = frame.f_back
+    raise KeyboardInterrupt
+
+
+def _explain(error: Exception) -> tuple[str, int]:
+    """Return the one-line message and the exit code of an error."""
+    if isinstance(error, GsdmsrError):
+        return str(error), error.exit_code
+    if isinstance(error, _CommandLineError):
+        message = error.format_message().replace("Value error, ", "")
+        return message or "missing command; see --help", UsageError.exit_code
+    if isinstance(error, OSError) and error.errno in _MACHINE_ERRNOS:
+        where = f"{error.filename}: " if error.filename else ""
+        return f"{where}{error.strerror}; free space or choose another place", 3
+    if type(error).__name__ == "OutOfMemoryError":  # torch's, which is not imported here
+        return (
+            "the GPU's memory is full; lower --set density.cap=..., raise --downscale, lower "
+            "--set data.cache_mib=..., or use --device cpu"
+        ), 3
+    hint = "set GSDMSR_DEBUG=1 for the traceback"
+    return f"internal: {type(error).__name__}: {error} ({hint})", 1

@@ -1,0 +1,15 @@
+"""Options and arguments that several commands share."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+RunFolder = Annotated[Path, typer.Argument(metavar="RUN", help="Folder that train wrote.")]
+MovedData = Annotated[
+    Path | None, typer.Option("--data", metavar="DIR", help="Where the data lies now, if moved.")
+]
+Json = Annotated[bool, typer.Option("--json", help="Print one JSON object and nothing else.")]
+Background = Literal["white", "black"]

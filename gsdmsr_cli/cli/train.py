@@ -1,0 +1,79 @@
+"""The options of `gsdmsr train`, and the call of the command with them."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+from gsdmsr_cli.cli.options import Background
+from gsdmsr_cli.ground.errors import UsageError
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command."""
+    app.command()(train)
+
+
+def train(
+    data: Annotated[Path, typer.Option(metavar="DIR", help="Scene folder, such as a D-NeRF one.")],
+    out: Annotated[Path, typer.Option(metavar="RUN", help="Run folder to write.")],
+    preset: Annotated[
+        str | None, typer.Option(metavar="NAME", help="Preset to start from.")
+    ] = None,
+    config: Annotated[
+        Path | None, typer.Option(metavar="F.yaml", help="File of options over the preset.")
+    ] = None,
+    set_: Annotated[
+        list[str] | None, typer.Option("--set", metavar="a.b=v", help="One option; repeatable.")
+    ] = None,
+    budget: Annotated[
+        str | None, typer.Option(metavar="8m", help="Wall time of training: 90s, 8m, 1.5h.")
+    ] = None,
+    steps: Annotated[
+        int | None, typer.Option(metavar="N", help="Number of steps instead of a budget.")
+    ] = None,
+    downscale: Annotated[
+        int | None, typer.Option(metavar="N", help="Divide both sides of pictures by N.")
+    ] = None,
+    background: Annotated[
+        Background | None, typer.Option(help="Colour behind transparent pixels.")
+    ] = None,
+    seed: Annotated[int | None, typer.Option(metavar="N", help="Seed of random choices.")] = None,
+    device: Annotated[
+        Literal["auto", "cpu", "cuda"], typer.Option(help="Where to compute.")
+    ] = "auto",
+    threads: Annotated[
+        int | None, typer.Option(metavar="N", help="CPU threads; 0 takes all cores.")
+    ] = None,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Go on from RUN's last checkpoint.")
+    ] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an earlier RUN.")] = False,
+) -> None:
+    """Reconstruct a moving scene from its pictures."""
+    if budget is not None and steps is not None:
+        raise UsageError("--budget and --steps are both given; drop one")
+    if resume and overwrite:
+        raise UsageError("--resume and --overwrite are both given; drop one")
+    from gsdmsr_cli.commands import train as command
+
+    options = {
+        "training.budget": budget,
+        "training.steps": steps,
+        "data.downscale": downscale,
+        "data.background": background,
+        "training.seed": seed,
+        "training.threads": threads,
+    }
+    overrides = [*(set_ or []), *_overrides(options)]
+    command.run(data, out, preset, config, overrides, device, resume, overwrite)
+
+
+def _overrides(options: dict[str, str | int | None]) -> list[str]:
+    """Return ``--set`` texts of the options that are given; steps put an end to a budget."""
+    given = {key: value for key, value in options.items() if value is not None}
+    no_budget = ["training.budget=null"] if "training.steps" in given else []
+    return no_budget + [f"{key}={json.dumps(value)}" for key, value in given.items()]

@@ -1,0 +1,1 @@
+"""A small moving scene, ray-traced."""

@@ -1,1 +1,0 @@
-"""Plane grids and small networks that motions share."""

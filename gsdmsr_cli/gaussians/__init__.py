@@ -1,0 +1,1 @@
+"""Splats, what is drawn of them at an instant, and the picture that an engine makes."""

@@ -1,0 +1,57 @@
+"""What a measurement was made on: processor, memory, versions."""
+
+from __future__ import annotations
+
+import os
+import platform
+import sys
+from importlib import metadata
+from pathlib import Path
+
+from gsdmsr_cli import __version__
+
+_PACKAGES = ("torch", "numba", "numpy")
+
+
+def cache_home() -> Path:
+    """Return the folder for what can be made again, such as compiled kernels."""
+    return Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "gsdmsr"
+
+
+def cpu_name() -> str:
+    """Return the processor's model as the system names it."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines()
+    except OSError:
+        lines = []
+    names = (line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
+    return next(names, platform.processor() or platform.machine())
+
+
+def cores() -> int:
+    """Return how many cores this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def peak_rss_mib(workers: int = 0) -> float | None:
+    """Return the most memory this process has held so far [MiB], or None where nobody counts.
+
+    Each of the worker processes that have ended counts like the largest of them; what they share
+    with this process is counted again.
+    """
+    if sys.platform == "win32":
+        return None
+    import resource
+
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    if workers:
+        peak += workers * resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss
+    return peak / (1024 * 1024 if sys.platform == "darwin" else 1024)
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of gsdmsr, of Python and of the packages that numbers depend on."""
+    packages = {name: metadata.version(name) for name in _PACKAGES}
+    return {"gsdmsr": __version__, "python": platform.python_version(), **packages}

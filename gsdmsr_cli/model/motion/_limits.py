@@ -1,0 +1,43 @@
+"""Checks that options of motions ask for sizes of grids and networks that the kernels support.
+
+The limits are those of all devices, so that what has been trained on one goes on on another.
+"""
+
+from __future__ import annotations
+
+from gsdmsr_cli.backends.cpu.simd import LANES
+from gsdmsr_cli.backends.cuda.compiler import MOST_LEVELS
+from gsdmsr_cli.options.strict import require
+
+
+def require_multiples(options: object, *keys: str, least: int = LANES) -> None:
+    """Check that options are multiples of 16, ``least`` or more, in a ``__post_init__``.
+
+    Raises:
+        InvalidError: one is not.
+    """
+    for key in keys:
+        value = getattr(options, key)
+        ok = value >= least and value % LANES == 0
+        require(options, key, ok, f"a multiple of {LANES}, {least} or more")
+
+
+def require_resolutions(options: object, *keys: str) -> None:
+    """Check that resolutions of grids along an axis are 2 or more.
+
+    Raises:
+        InvalidError: one is not.
+    """
+    for key in keys:
+        require(options, key, getattr(options, key) >= 2, "2 or more")
+
+
+def require_levels(options: object, key: str, besides: int = 0) -> None:
+    """Check the resolution of each level of a grid that is read with ``besides`` other levels.
+
+    Raises:
+        InvalidError: there are none, too many, or one has a resolution below 2.
+    """
+    levels, most = getattr(options, key), MOST_LEVELS - besides
+    ok = 1 <= len(levels) <= most and min(levels) >= 2
+    require(options, key, ok, f"1 to {most} whole numbers, each 2 or more")

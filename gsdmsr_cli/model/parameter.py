@@ -1,0 +1,50 @@
+"""One tensor of a model: its name, its rows, and the learning rate that it follows."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+from torch import Tensor
+
+Rate = str | tuple[float, float]
+"""A learning rate: the name of one of the preset's (a field of ``OptimizerOptions``), or its own
+values at the start and at the end of a training, log-linear in between."""
+
+
+@dataclass(frozen=True, eq=False)
+class Parameter:
+    """One tensor of a model, trained or not.
+
+    The optimiser, averaging, shared memory, checkpoints, saliency and resizing all read lists of
+    these and nothing else.
+
+    Attributes:
+        name: under which it is saved, unique in its list.
+        tensor: its values, contiguous; the same object for good, whose memory a resize replaces.
+        per_splat: whether it has a row for each splat; if not, all splats share it.
+        rate: the learning rate that it follows; None for a buffer, of any dtype, that is saved but
+            not trained.
+    """
+
+    name: str
+    tensor: Tensor
+    per_splat: bool = False
+    rate: Rate | None = None
+
+    def __post_init__(self) -> None:
+        self.tensor.requires_grad_(self.rate is not None)
+
+    def set_values(self, values: Tensor) -> None:
+        """Give the tensor other values, of any shape and on any device."""
+        self.tensor.data = values.detach().contiguous()
+        self.tensor.grad = None
+
+    def take(self, rows: Tensor) -> None:
+        """Make row i what row ``rows[i]`` was; rows is (M,) int64."""
+        self.set_values(self.tensor.detach()[rows])
+
+
+def tensors_of(parameters: Iterable[Parameter]) -> dict[str, Tensor]:
+    """Return the tensors by name, in the order of the list."""
+    return {parameter.name: parameter.tensor for parameter in parameters}

@@ -1,0 +1,26 @@
+"""The nearest of few points for each of many, on a GPU; see nearest.cu."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from gsdmsr_cli.backends.cuda.launch import blocks, launch
+
+_THREADS = 128
+
+
+def nearest(points: Tensor, nodes: Tensor, near: Tensor) -> Tensor:
+    """Return the rows of the nearest nodes of each point, in ascending order, (N, K) int32.
+
+    Args:
+        points, nodes: (N, 3), (M, 3).
+        near: (N, K) int32 guesses, see ``ops.nearest.nearest_nodes``; K is at most M.
+    """
+    found = near.clone(memory_format=torch.contiguous_format)
+    count, kept = found.shape
+    launch(
+        "nearest", "nearest", (blocks(count, _THREADS), 1), _THREADS,
+        count, len(nodes), kept, points.contiguous(), nodes.contiguous(), found,
+    )  # fmt: skip
+    return found

@@ -1,0 +1,222 @@
+"""L1 and SSIM of a drawn picture against an 8-bit target, with their gradients.
+
+SSIM is that of 3DGS: an 11 x 11 Gaussian window of sigma 1.5, zero padding, averaged over pixels
+and channels (Wang et al. 2004). Pictures are planes (3, H', W') whose width is a multiple of 16 and
+whose part beyond H x W does not count.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import float32, prange
+
+from gsdmsr_cli.backends.cpu import simd
+from gsdmsr_cli.backends.cpu.jit import inline, parallel, serial
+from gsdmsr_cli.ground import ssim
+
+STRIP = 32
+"""Rows that one task handles at a time; its horizontal sums stay in cache."""
+
+_LANES = simd.LANES
+_REACH = ssim.REACH
+_C1, _C2 = float32(ssim.C1), float32(ssim.C2)
+_MARGIN = _LANES
+WINDOW = ssim.WINDOW.astype(np.float32)
+_W0, _W1, _W2, _W3, _W4, _W5 = (float32(w) for w in WINDOW[: _REACH + 1])
+_SCALE = float32(1 / 255)
+
+
+@parallel
+def to_float(target, planes):
+    """Write an 8-bit target (3, H, W) as planes (3, H', W') in [0, 1], 0 outside the picture."""
+    channels, height, width = target.shape
+    pixels, out, stride = target.reshape(-1), planes.reshape(-1), planes.shape[2]
+    for task in prange(channels * planes.shape[1]):
+        channel, y = task // planes.shape[1], task % planes.shape[1]
+        if y >= height:
+            planes[channel, y] = float32(0)
+            continue
+        row = np.empty(_LANES, np.float32)
+        for x in range(0, stride, _LANES):
+            values = load_target(pixels, (channel * height + y) * width + x, width - x, row)
+            simd.store(out, task * stride + x, values)
+
+
+@parallel
+def l1(drawn, target, height, width, weight, gradient, sums):
+    """Write weight * sign(drawn - target), 0 outside the picture, and sums of |differences|.
+
+    Args:
+        drawn, gradient: planes (3, H', W').
+        target: (3, H, W) uint8.
+        sums: (3 * H',) out.
+    """
+    rows, stride = drawn.shape[1], drawn.shape[2]
+    flat, pixels, out = drawn.reshape(-1), target.reshape(-1), gradient.reshape(-1)
+    for task in prange(3 * rows):
+        channel, y = task // rows, task % rows
+        if y >= height:
+            gradient[channel, y] = float32(0)
+            sums[task] = 0
+            continue
+        row, total = np.empty(_LANES, np.float32), simd.splat(float32(0))
+        for x in range(0, stride, _LANES):
+            at, inside = task * stride + x, width - x
+            wanted = load_target(pixels, (channel * height + y) * width + x, inside, row)
+            shown = simd.load(flat, at) * simd.first_lanes(inside)
+            distance, slope = distances(shown - wanted, weight)
+            simd.store(out, at, slope)
+            total = total + distance
+        sums[task] = simd.reduce_sum(total)
+
+
+@inline
+def load_target(pixels, at, inside, row):
+    """Return 16 values of a flat 8-bit picture in [0, 1], 0 beyond the first ``inside`` of them.
+
+    Args:
+        row: (16,) scratch.
+    """
+    if inside >= _LANES:
+        return simd.load_bytes(pixels, at) * _SCALE
+    for x in range(_LANES):
+        row[x] = float32(pixels[at + x]) if x < inside else float32(0)
+    return simd.load(row, 0) * _SCALE
+
+
+@inline
+def distances(differences, weight):
+    """Return |difference| and weight * sign(difference) of every lane."""
+    zero = simd.splat(float32(0))
+    opposite = zero - differences
+    slopes = simd.where_positive(differences, simd.splat(weight))
+    slopes = slopes - simd.where_positive(opposite, simd.splat(weight))
+    return simd.maximum(differences, opposite), slopes
+
+
+@inline
+def _blur(flat, at, step):
+    """Return the windowed mean of 16 values from ``at`` on and their neighbours, ``step`` apart.
+
+    Written out, the constants become part of the code, and mirrored taps share a product.
+    """
+    centre = simd.load(flat, at) * _W5
+    one = (simd.load(flat, at - step) + simd.load(flat, at + step)) * _W4
+    two = (simd.load(flat, at - 2 * step) + simd.load(flat, at + 2 * step)) * _W3
+    three = (simd.load(flat, at - 3 * step) + simd.load(flat, at + 3 * step)) * _W2
+    four = (simd.load(flat, at - 4 * step) + simd.load(flat, at + 4 * step)) * _W1
+    five = (simd.load(flat, at - 5 * step) + simd.load(flat, at + 5 * step)) * _W0
+    return (centre + one) + (two + three) + (four + five)
+
+
+@parallel
+def ssim_maps(drawn, target, height, width, maps, sums):
+    """Write the partial derivatives of SSIM's sum that its gradient is convolved from.
+
+    Args:
+        maps: (3, 3, H', W') out: derivatives by the windowed mean of x, of x x and of x y.
+        sums: (3 * strips,) float64 out, shares of the sum of SSIM over pixels and channels.
+    """
+    rows, stride = drawn.shape[1], drawn.shape[2]
+    strips = (height + STRIP - 1) // STRIP
+    x_flat, y_flat, out = drawn.reshape(-1), target.reshape(-1), maps.reshape(-1)
+    size, pitch = 3 * rows * stride, stride + 2 * _MARGIN
+    for task in prange(3 * strips):
+        channel, top = task // strips, task % strips * STRIP
+        bottom = min(top + STRIP, height)
+        # one row of x, y, x x + y y and x y with a margin of zeros; only the sum of the squares
+        # matters, since the variances enter SSIM as a sum
+        row = np.zeros(4 * pitch, np.float32)
+        layer = (STRIP + 2 * _REACH) * stride
+        across = np.zeros(4 * layer, np.float32)
+        zero, one, two = simd.splat(float32(0)), simd.splat(float32(1)), float32(2)
+        for y in range(max(top - _REACH, 0), min(bottom + _REACH, height)):
+            at = (channel * rows + y) * stride
+            for x in range(0, width, _LANES):
+                inside = simd.first_lanes(width - x)
+                a, b = simd.load(x_flat, at + x) * inside, simd.load(y_flat, at + x) * inside
+                simd.store(row, _MARGIN + x, a)
+                simd.store(row, pitch + _MARGIN + x, b)
+                simd.store(row, 2 * pitch + _MARGIN + x, a * a + b * b)
+                simd.store(row, 3 * pitch + _MARGIN + x, a * b)
+            o = (y - top + _REACH) * stride
+            for x in range(0, width, _LANES):
+                for m in range(4):
+                    simd.store(across, m * layer + o + x, _blur(row, m * pitch + _MARGIN + x, 1))
+        total = zero
+        for y in range(top, bottom):
+            for x in range(0, width, _LANES):
+                o = (y - top + _REACH) * stride + x
+                mx, my = _blur(across, o, stride), _blur(across, o + layer, stride)
+                squares = _blur(across, o + 2 * layer, stride)
+                mxy = _blur(across, o + 3 * layer, stride)
+                cross, square = mx * my, mx * mx + my * my
+                c1, c2 = simd.splat(_C1), simd.splat(_C2)
+                inverse1, inverse = one / (square + c1), one / (squares - square + c2)
+                luminance = (cross * two + c1) * inverse1
+                structure = ((mxy - cross) * two + c2) * inverse
+                value = luminance * structure
+                by_xx = zero - value * inverse
+                by_xy = luminance * inverse * two
+                by_x = (my - mx * luminance) * structure * two * inverse1
+                by_x = by_x - mx * by_xx * two - my * by_xy
+                inside = simd.first_lanes(width - x)
+                total = total + value * inside
+                o = (channel * rows + y) * stride + x
+                simd.store(out, o, by_x * inside)
+                simd.store(out, size + o, by_xx * inside)
+                simd.store(out, 2 * size + o, by_xy * inside)
+        sums[task] = simd.reduce_sum(total)
+
+
+@parallel
+def ssim_gradient(drawn, target, height, width, maps, weight, gradient):
+    """Add weight * d(sum of SSIM)/d(drawn) to ``gradient``, from the maps of ``ssim_maps``."""
+    rows, stride = drawn.shape[1], drawn.shape[2]
+    strips = (height + STRIP - 1) // STRIP
+    x_flat, y_flat, m_flat = drawn.reshape(-1), target.reshape(-1), maps.reshape(-1)
+    out, size, pitch = gradient.reshape(-1), 3 * rows * stride, stride + 2 * _MARGIN
+    for task in prange(3 * strips):
+        channel, top = task // strips, task % strips * STRIP
+        bottom = min(top + STRIP, height)
+        row = np.zeros(3 * pitch, np.float32)
+        layer = (STRIP + 2 * _REACH) * stride
+        across = np.zeros(3 * layer, np.float32)
+        two = float32(2)
+        for y in range(max(top - _REACH, 0), min(bottom + _REACH, height)):
+            at = (channel * rows + y) * stride
+            o = (y - top + _REACH) * stride
+            for m in range(3):
+                # the maps are 0 beyond the picture's width, as far as they were written
+                for x in range(0, width, _LANES):
+                    simd.store(row, m * pitch + _MARGIN + x, simd.load(m_flat, m * size + at + x))
+                for x in range(0, width, _LANES):
+                    simd.store(across, m * layer + o + x, _blur(row, m * pitch + _MARGIN + x, 1))
+        for y in range(top, bottom):
+            for x in range(0, width, _LANES):
+                o = (y - top + _REACH) * stride + x
+                a, b = _blur(across, o, stride), _blur(across, o + layer, stride)
+                c = _blur(across, o + 2 * layer, stride)
+                o = (channel * rows + y) * stride + x
+                d = a + simd.load(x_flat, o) * b * two + simd.load(y_flat, o) * c
+                d = d * weight * simd.first_lanes(width - x)
+                simd.store(out, o, simd.load(out, o) + d)
+
+
+@serial
+def compare(drawn, target, height, width, ssim_weight, gradient):
+    """Return (1 - w) L1 + w (1 - SSIM), and write its gradient; arguments as in ``l1``."""
+    count = 3 * height * width
+    sums = np.empty(3 * drawn.shape[1])
+    l1(drawn, target, height, width, float32((1 - ssim_weight) / count), gradient, sums)
+    loss = (1 - ssim_weight) * sums.sum() / count
+    if ssim_weight > 0:
+        wanted = np.empty_like(drawn)
+        to_float(target, wanted)
+        maps = np.empty((3, 3, drawn.shape[1], drawn.shape[2]), np.float32)
+        shares = np.empty(3 * ((height + STRIP - 1) // STRIP))
+        ssim_maps(drawn, wanted, height, width, maps, shares)
+        loss += ssim_weight * (1 - shares.sum() / count)
+        factor = float32(-ssim_weight / count)
+        ssim_gradient(drawn, wanted, height, width, maps, factor, gradient)
+    return loss

@@ -1,0 +1,1 @@
+"""Kernels that draw splats: projection, colours, tiles, blending; and their gradients."""

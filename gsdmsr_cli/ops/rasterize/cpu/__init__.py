@@ -1,0 +1,1 @@
+"""The kernels of drawing for the CPU, one file per stage."""

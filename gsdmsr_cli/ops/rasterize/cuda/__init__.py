@@ -1,0 +1,1 @@
+"""The kernels of drawing for GPUs, and what launches them."""

@@ -1,0 +1,125 @@
+"""Splats that follow the nodes near them: SC-GS's sparse control points (Huang et al., CVPR 2024).
+
+Linear blend skinning, section 3.2 there: a node at p with rotation R and offset T takes a place x
+to R (x - p) + p + T, and a splat goes to the weighted mean of what its nearest nodes make of it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.autograd import Function
+from torch.autograd.function import once_differentiable
+
+from gsdmsr_cli.backends.tensors import array
+from gsdmsr_cli.gaussians.splats import Splats
+from gsdmsr_cli.ops.choose import choose
+from gsdmsr_cli.ops.skin import cpu as kernels
+from gsdmsr_cli.ops.skin import cuda
+from gsdmsr_cli.ops.skin.twin import COLUMNS, skin_twin, transforms_twin
+
+
+def transforms(nodes: Tensor, deformation: Tensor) -> Tensor:
+    """Return what nodes (M, 3) do to the splats that follow them, (M, 19), see ``COLUMNS``.
+
+    Args:
+        nodes: their canonical places.
+        deformation: (M, 10) offset of the place, of the quaternion (1, 0, 0, 0), which is then of
+            unit length, and of the log scales.
+    """
+    form = choose(nodes, deformation)
+    if form == "cuda":
+        return cuda.transforms(nodes, deformation, kernels.SHORTEST)
+    if form == "cpu":
+        made: Tensor = _Transform.apply(nodes, deformation)
+        return made
+    return transforms_twin(nodes, deformation)
+
+
+def skin(
+    splats: Splats, nodes: Tensor, log_radii: Tensor, transforms: Tensor, near: Tensor
+) -> Splats:
+    """Return N splats where their nodes take them.
+
+    Args:
+        splats: N canonical splats.
+        nodes: (M, 3) canonical places of the nodes.
+        log_radii: (M,) logarithms of how far they reach [world units].
+        transforms: (M, 19), see ``transforms``.
+        near: (N, K) int32, the nodes of each splat.
+    """
+    stored = splats.means, splats.quats, splats.log_scales
+    by = nodes, log_radii, transforms, near
+    form = choose(*stored, *by[:3])
+    if form == "cuda":
+        means, quats, log_scales = cuda.skin(stored, *by)
+    elif form == "cpu":
+        means, quats, log_scales = _Skin.apply(*stored, *by)
+    else:
+        return skin_twin(splats, *by)
+    return replace(splats, means=means, quats=quats, log_scales=log_scales)
+
+
+__all__ = ["COLUMNS", "skin", "skin_twin", "transforms", "transforms_twin"]
+
+
+class _Transform(Function):
+    @staticmethod
+    def forward(ctx: Any, nodes: Tensor, deformation: Tensor) -> Tensor:
+        nodes, deformation = nodes.contiguous(), deformation.contiguous()
+        made = nodes.new_empty(len(nodes), sum(COLUMNS))
+        kernels.transform(*_arrays(nodes, deformation, made))
+        ctx.save_for_backward(nodes, deformation, made)
+        return made
+
+    @staticmethod
+    @once_differentiable  # type: ignore[untyped-decorator]
+    def backward(ctx: Any, given: Tensor) -> tuple[Tensor, Tensor]:
+        nodes, deformation, made = ctx.saved_tensors
+        gradients = torch.empty_like(nodes), torch.empty_like(deformation)
+        kernels.transform_backward(
+            *_arrays(nodes, deformation, made, given.contiguous(), *gradients)
+        )
+        return gradients
+
+
+class _Skin(Function):
+    @staticmethod
+    def forward(
+        ctx: Any,
+        means: Tensor,
+        quats: Tensor,
+        log_scales: Tensor,
+        nodes: Tensor,
+        log_radii: Tensor,
+        transforms: Tensor,
+        near: Tensor,
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        means, quats, log_scales = (t.contiguous() for t in (means, quats, log_scales))
+        sharpness = torch.exp(-2 * log_radii)
+        by = [t.contiguous() for t in (nodes, sharpness, transforms, near)]
+        weights = torch.empty(near.shape)
+        moved = torch.empty_like(means), torch.empty_like(quats), torch.empty_like(log_scales)
+        kernels.skin(*_arrays(means, quats, log_scales, *by, weights, *moved))
+        ctx.save_for_backward(means, quats, *by, weights)
+        return moved
+
+    @staticmethod
+    @once_differentiable  # type: ignore[untyped-decorator]
+    def backward(ctx: Any, *given: Tensor) -> tuple[Tensor | None, ...]:
+        means, quats, *by, near, weights = ctx.saved_tensors
+        learnt = means, quats, *by
+        d_moved, d_turned, d_scaled = (d.contiguous() for d in given)
+        gradients = [torch.empty_like(tensor) for tensor in learnt]
+        incoming = d_moved, d_turned, d_scaled
+        kernels.skin_backward(*_arrays(*learnt, near, weights, *incoming, *gradients))
+        d_means, d_quats, *others = gradients
+        return d_means, d_quats, d_scaled, *others, None
+
+
+def _arrays(*tensors: Tensor) -> Sequence[Any]:
+    return [array(tensor) for tensor in tensors]

@@ -1,0 +1,354 @@
+"""Every option of a training run, as frozen dataclasses per topic, and how a preset is loaded.
+
+Schedules are functions of progress in [0, 1]: step / steps or, with a budget, elapsed / budget.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from typing import Any, Literal
+
+from gsdmsr_cli.backends.cuda.compiler import MOST_VIEWS
+from gsdmsr_cli.ground.errors import UsageError
+from gsdmsr_cli.options import preset_files, strict
+from gsdmsr_cli.options.strict import require
+
+_SECONDS = {"s": 1.0, "m": 60.0, "h": 3600.0}
+_DURATION = "a positive duration such as 90s, 8m or 1.5h"
+_PROGRESS = "a progress from 0 to 1"
+
+EVENTS = ("density", "opacity_reset", "thinning", "stillness")
+"""Events that every training asks after a step, unless the preset says otherwise."""
+
+BACKGROUNDS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
+"""The colours that pictures may be laid on."""
+
+
+def _duration(text: str) -> float | None:
+    match = re.fullmatch(r"(\d+(?:\.\d+)?)([smh])", text)
+    seconds = float(match[1]) * _SECONDS[match[2]] if match else 0.0
+    return seconds if 0.0 < seconds < math.inf else None
+
+
+def parse_duration(text: str) -> float:
+    """Return the seconds of "90s", "8m", "2.5m" or "1h".
+
+    Raises:
+        UsageError: the text is not a positive duration.
+    """
+    seconds = _duration(text)
+    if seconds is None:
+        raise UsageError(f"'{text}' is not a duration; allowed: {_DURATION}")
+    return seconds
+
+
+def _require_progress(options: object, *keys: str) -> None:
+    for key in keys:
+        require(options, key, 0.0 <= getattr(options, key) <= 1.0, _PROGRESS)
+
+
+def _require_at_least(options: object, least: int, *keys: str) -> None:
+    for key in keys:
+        require(options, key, getattr(options, key) >= least, f"{least} or more")
+
+
+def _require_positive(options: object, *keys: str) -> None:
+    for key in keys:
+        require(options, key, getattr(options, key) > 0, "a number above 0")
+
+
+@dataclass(frozen=True)
+class DataOptions:
+    """How pictures are read.
+
+    Attributes:
+        background: colour behind transparent pixels, in training and evaluation.
+        downscale: both sides of every picture are divided by this whole number, by area.
+        cache_mib: memory for decoded pictures, halved pictures and masks that are kept, of all
+            processes together [MiB]; 0 keeps none. On a GPU as much again for copies there.
+    """
+
+    background: Literal["white", "black"] = "white"
+    downscale: int = 1
+    cache_mib: int = 4096
+
+    def __post_init__(self) -> None:
+        _require_at_least(self, 1, "downscale")
+        _require_at_least(self, 0, "cache_mib")
+
+
+@dataclass(frozen=True)
+class SplatOptions:
+    """The splats to start from.
+
+    Attributes:
+        count: number of splats where the scene brings no points or, with the start "surfaces",
+            fewer than that.
+        start: where they lie: "box" evenly in the scene's box, "silhouettes" where the silhouettes
+            of the train views overlap, "surfaces" where neighbouring train views agree.
+        opacity: their opacity, between 0 and 1.
+        sh_degree: highest degree of the spherical harmonics, 0 to 3.
+        sh_start: progress at which degree 1 joins; higher degrees follow.
+    """
+
+    count: int = 2500
+    start: Literal["box", "silhouettes", "surfaces"] = "silhouettes"
+    opacity: float = 0.1
+    sh_degree: int = 1
+    sh_start: float = 0.3
+
+    def __post_init__(self) -> None:
+        _require_at_least(self, 1, "count")
+        require(self, "opacity", 0.0 < self.opacity < 1.0, "a number between 0 and 1, neither")
+        require(self, "sh_degree", 0 <= self.sh_degree <= 3, "0 to 3")
+        _require_progress(self, "sh_start")
+
+
+@dataclass(frozen=True)
+class TrainingOptions:
+    """How long to train, and in which phases.
+
+    Attributes:
+        steps: length of the training [steps], unless there is a budget.
+        budget: length of the training as wall time, such as "8m"; null counts steps.
+        static_until: progress up to which nothing moves.
+        static_steps: most steps for which nothing moves.
+        views_per_step: pictures drawn and compared per step, 1 to 16.
+        tiles_per_view: tiles of 16 x 16 px that are chosen of each, once SSIM does not count any
+            more; 0 is all.
+        low_resolution_until: progress up to which pictures of half the size are drawn; 0 is never.
+        average_from: progress from which the result is the mean of the steps' values; 1 is never.
+        checkpoint_minutes: time between checkpoints [min].
+        seed: seed of every random choice.
+        threads: number of CPU threads; 0 takes all cores.
+        precision: what the motion's grids and networks are read and computed in on a GPU; values
+            that are trained, and their gradients, are float32 all the same.
+    """
+
+    steps: int = 10000
+    budget: str | None = None
+    static_until: float = 0.04
+    static_steps: int = 300
+    views_per_step: int = 2
+    tiles_per_view: int = 0
+    low_resolution_until: float = 0.3
+    average_from: float = 0.9
+    checkpoint_minutes: float = 2.0
+    seed: int = 0
+    threads: int = 0
+    precision: Literal["float32", "bf16", "fp16"] = "float32"
+
+    def __post_init__(self) -> None:
+        _require_at_least(self, 1, "steps")
+        # the limit of a GPU is that of the CPU as well: a training may go on on the other
+        within = 1 <= self.views_per_step <= MOST_VIEWS
+        require(self, "views_per_step", within, f"1 to {MOST_VIEWS}")
+        known = self.budget is None or _duration(self.budget) is not None
+        require(self, "budget", known, f"null or {_DURATION}")
+        _require_progress(self, "static_until", "low_resolution_until", "average_from")
+        _require_positive(self, "checkpoint_minutes")
+        require(self, "seed", 0 <= self.seed < 2**32, "0 to 4294967295")
+        _require_at_least(self, 0, "static_steps", "threads", "tiles_per_view")
+
+
+@dataclass(frozen=True)
+class LossOptions:
+    """How a drawn picture is compared with the true one.
+
+    Attributes:
+        ssim: weight w of (1 - w) L1 + w (1 - SSIM), 0 to 1.
+        ssim_until: progress up to which the SSIM term counts; later w is 0.
+        terms: further terms, each a "name" and the options that its own file declares, see
+            ``training.losses``.
+    """
+
+    ssim: float = 0.2
+    ssim_until: float = 0.3
+    terms: tuple[dict[str, Any], ...] = ()
+
+    def __post_init__(self) -> None:
+        named = all(isinstance(entry.get("name"), str) for entry in self.terms)
+        require(self, "terms", named, "a list of mappings, each with the name of a term")
+        require(self, "ssim", 0.0 <= self.ssim <= 1.0, "a weight from 0 to 1")
+        _require_progress(self, "ssim_until")
+
+
+@dataclass(frozen=True)
+class OptimizerOptions:
+    """Learning rates of Adam as (start, end), log-linear in progress.
+
+    Attributes:
+        means: of the centres, in units of the scene's radius.
+        log_scales: of the logarithms of the scales.
+        quats: of the rotations.
+        logit_opacities: of the logits of the opacities.
+        sh: of the colours' coefficients.
+        sh_rest: rate of all coefficients but the constant ones, in units of that; 3DGS has 0.05.
+        planes: of the motion's plane grids.
+        network: of the motion's networks.
+        embeddings: of the features that a motion holds for each splat.
+    """
+
+    means: tuple[float, float] = (2.5e-4, 5e-6)
+    log_scales: tuple[float, float] = (5e-3, 2e-3)
+    quats: tuple[float, float] = (1e-3, 5e-4)
+    logit_opacities: tuple[float, float] = (0.05, 0.01)
+    sh: tuple[float, float] = (2.5e-3, 1e-3)
+    sh_rest: float = 1.0
+    planes: tuple[float, float] = (8e-3, 5e-4)
+    network: tuple[float, float] = (8e-4, 1e-4)
+    embeddings: tuple[float, float] = (5e-3, 2e-3)
+
+    def __post_init__(self) -> None:
+        _require_positive(self, "sh_rest")
+        for rate in fields(self):
+            value = getattr(self, rate.name)
+            ok = rate.name == "sh_rest" or min(value) > 0
+            require(self, rate.name, ok, "[start, end], both above 0")
+
+
+@dataclass(frozen=True)
+class DensityOptions:
+    """When and where splats are cloned, split, pruned and reset (3DGS, Kerbl et al. 2023).
+
+    Attributes:
+        every: least interval of growing and pruning [steps].
+        rounds: most times that splats grow, spread evenly over progress: a longer training has
+            more steps in between, not more splats.
+        start: first step at which it happens [steps].
+        until: progress at which it ends.
+        gradient: mean norm of the screen-space gradient above which a splat grows [1 / NDC unit].
+        split_scale: a growing splat is split above this scale and cloned below [scene radii].
+        prune_scale: a splat above this scale is pruned [scene radii].
+        prune_opacity: a splat below this opacity is pruned.
+        reset_at: progress of each opacity reset.
+        cap: most splats there may be.
+        thin_at: progress of each thinning, after which the splats that the pictures depend on least
+            are gone, see ``training.population.thinning``.
+        thin_share: share of the splats that a thinning takes.
+    """
+
+    every: int = 100
+    rounds: int = 1000
+    start: int = 300
+    until: float = 0.35
+    gradient: float = 9e-4
+    split_scale: float = 0.01
+    prune_scale: float = 0.1
+    prune_opacity: float = 0.005
+    reset_at: tuple[float, ...] = (0.12,)
+    cap: int = 100000
+    thin_at: tuple[float, ...] = ()
+    thin_share: float = 0.3
+
+    def __post_init__(self) -> None:
+        _require_at_least(self, 1, "every", "rounds", "cap")
+        _require_at_least(self, 0, "start")
+        _require_progress(self, "until")
+        _require_positive(self, "gradient", "split_scale", "prune_scale")
+        require(self, "prune_opacity", 0.0 <= self.prune_opacity < 1.0, "0 or more, below 1")
+        require(self, "thin_share", 0.0 <= self.thin_share < 1.0, "0 or more, below 1")
+        for key in ("reset_at", "thin_at"):
+            ok = all(0.0 <= progress <= 1.0 for progress in getattr(self, key))
+            require(self, key, ok, f"a list, each item {_PROGRESS}")
+
+
+@dataclass(frozen=True)
+class SaliencyOptions:
+    """Which splats are spared the optimiser and the motion (GS-DMSR, Lu et al. 2026, section 4.1).
+
+    Attributes:
+        gate: what becomes of a step of a splat of low saliency: "none" leaves it; "scale" it is
+            multiplied by ``low_rate``; "freeze" it is left out, moments and all; "sparse" it is
+            taken every 8th time.
+        gate_from: progress from which the gate works, once the motion has begun.
+        threshold: saliency above which a splat is high, see ``training.saliency.step_saliency``.
+        quantile: if above 0, the threshold is instead the saliency below which this share of all
+            splats lies.
+        release: share of the threshold below which a splat is low; between the two it stays what
+            it is.
+        low_rate: learning rate of low splats in units of the others'.
+        units: "drawn" weighs components by what they do to the picture, "raw" adds them up.
+        smoothing: weight of the past in the mean of a splat's saliency; 0 takes the last step's.
+        hold: least time between two changes of class [steps].
+        grace: time for which new splats are high, and all of them after a reset [steps].
+        field_every: interval at which low splats have gradients for shared fields [steps]; 1 is
+            always, 0 never.
+        still_from: progress from which splats that hardly move are let stand still, after growing
+            has ended; 1 is never.
+        still_every: interval of the search for them [steps].
+        still_below: motion saliency below which a splat stands still, see
+            ``training.population.stillness.motion_saliency``.
+    """
+
+    gate: Literal["none", "scale", "freeze", "sparse"] = "none"
+    gate_from: float = 0.35
+    threshold: float = 1e-3
+    quantile: float = 0.0
+    release: float = 0.5
+    low_rate: float = 0.01
+    units: Literal["drawn", "raw"] = "drawn"
+    smoothing: float = 0.9
+    hold: int = 50
+    grace: int = 500
+    field_every: int = 1
+    still_from: float = 1.0
+    still_every: int = 500
+    still_below: float = 0.05
+
+    def __post_init__(self) -> None:
+        _require_progress(self, "gate_from", "still_from")
+        _require_positive(self, "threshold", "low_rate", "still_below")
+        require(self, "quantile", 0.0 <= self.quantile <= 1.0, "0 to 1")
+        require(self, "release", 0.0 < self.release <= 1.0, "above 0, at most 1")
+        require(self, "smoothing", 0.0 <= self.smoothing < 1.0, "0 or more, below 1")
+        _require_at_least(self, 0, "hold", "grace", "field_every")
+        _require_at_least(self, 1, "still_every")
+
+
+@dataclass(frozen=True)
+class Preset:
+    """All options of one training run.
+
+    Attributes:
+        motion: "name" of the motion and the options that its own file declares.
+        layers: further layers of the model after the motion, each likewise, see ``model.layers``.
+        events: what may change the splats after a step, in this order: names of files of
+            ``training.population``, or mappings of a "name" and the file's own options.
+    """
+
+    data: DataOptions = field(default_factory=DataOptions)
+    splats: SplatOptions = field(default_factory=SplatOptions)
+    training: TrainingOptions = field(default_factory=TrainingOptions)
+    losses: LossOptions = field(default_factory=LossOptions)
+    optimizer: OptimizerOptions = field(default_factory=OptimizerOptions)
+    density: DensityOptions = field(default_factory=DensityOptions)
+    saliency: SaliencyOptions = field(default_factory=SaliencyOptions)
+    motion: dict[str, Any] = field(default_factory=lambda: {"name": "multiscale"})
+    layers: tuple[dict[str, Any], ...] = ()
+    events: tuple[str | dict[str, Any], ...] = EVENTS
+
+    def __post_init__(self) -> None:
+        named = isinstance(self.motion.get("name"), str)
+        require(self, "motion", named, "a mapping with the name of a motion")
+        for key, kind in (("layers", "layer"), ("events", "event")):
+            entries = [e for e in getattr(self, key) if not isinstance(e, str)]
+            named = all(isinstance(entry.get("name"), str) for entry in entries)
+            require(self, key, named, f"a list of mappings, each with the name of a {kind}")
+
+
+def load_preset(name: str | None, config: Path | None, overrides: Sequence[str]) -> Preset:
+    """Load preset ``name``, overridden by the YAML file ``config``, then by ``a.b=value`` texts.
+
+    ``motion`` stays a ``strict.Located``: the motion's own options are checked where it starts.
+
+    Raises:
+        UsageError: a preset or key is unknown, or a value has the wrong type or range; the message
+            names the file and line, or the override.
+    """
+    mapping = preset_files.resolve(name, config, overrides)
+    return strict.build(Preset, mapping, str(config or name or "default"))

@@ -1,0 +1,1 @@
+"""A captured scene: views with cameras and times, their pictures and other signals."""

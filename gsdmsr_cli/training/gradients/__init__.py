@@ -1,0 +1,1 @@
+"""Renders the views of a training step and takes their gradients, in one process or several."""

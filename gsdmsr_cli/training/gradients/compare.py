@@ -1,0 +1,132 @@
+"""Draws a model, compares the picture with a target, and takes the gradients."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from gsdmsr_cli.gaussians.frame import Frame
+from gsdmsr_cli.gaussians.moment import Moment
+from gsdmsr_cli.model.layer import Instant
+from gsdmsr_cli.model.model import Model
+from gsdmsr_cli.ops.photometric import photometric_loss, tile_errors
+from gsdmsr_cli.raster import Comparing, ComparingViews, Comparison, Engine
+from gsdmsr_cli.scene.camera import Camera
+from gsdmsr_cli.training.gradients.phase import ViewGradients
+
+
+def gradients_of(loss: Tensor, model: Model) -> Sequence[Tensor | None]:
+    """Return the gradients of a loss by all trained tensors of a model."""
+    return torch.autograd.grad(loss, list(model.trained().values()), allow_unused=True)
+
+
+def compare(
+    engine: Engine,
+    model: Model,
+    moment: Moment,
+    camera: Camera,
+    background: Tensor,
+    target: Tensor,
+    ssim_weight: float,
+    sh_degree: int | None = None,
+    tile_weights: Tensor | None = None,
+    counted: Tensor | None = None,
+) -> ViewGradients:
+    """Draw what a model is at a moment and compare the picture with a target.
+
+    Args:
+        engine: what draws.
+        model: whose trained tensors the gradients are taken by.
+        moment: the model's, at the time of the target or unmoved.
+        camera, background, sh_degree: see ``Engine.rasterize``.
+        target, ssim_weight: see ``photometric_loss``.
+        tile_weights: (tiles,) factors on the share of each tile in the loss, or None for 1
+            everywhere; only where SSIM has no weight.
+        counted: (H, W) bool, pixels that have a part in the loss, or None for all.
+    """
+    given = moment, camera, background, target, ssim_weight, sh_degree, tile_weights
+    if counted is None and moment.features is None and isinstance(engine, Comparing):
+        found = engine.compare(*given)
+    else:
+        frame = engine.rasterize(moment, camera, background, sh_degree)
+        found = compare_frame(frame, target, ssim_weight, tile_weights, counted)
+    size = camera.width, camera.height
+    gradients = gradients_of(found.loss, model)
+    return ViewGradients(found.loss.detach(), gradients, found.on_screen, size, found.errors)
+
+
+def compare_views(
+    engine: ComparingViews,
+    model: Model,
+    moments: Sequence[Moment],
+    cameras: Sequence[Camera],
+    background: Tensor,
+    targets: Sequence[Tensor],
+    ssim_weight: float,
+    sh_degree: int | None,
+    tile_weights: Sequence[Tensor | None],
+) -> list[ViewGradients]:
+    """Do what ``compare`` does of several views at once."""
+    weights = [own for own in tile_weights if own is not None]
+    loss, found = engine.compare_views(
+        moments, cameras, background, targets, ssim_weight, sh_degree, weights or None
+    )
+    gradients = gradients_of(loss, model)
+    nothing = [None] * len(gradients)
+    return [
+        ViewGradients(
+            own.loss, nothing if i else gradients, own.on_screen, (c.width, c.height), own.errors
+        )
+        for i, (own, c) in enumerate(zip(found, cameras, strict=True))
+    ]
+
+
+def draw_and_compare(
+    engine: Engine,
+    model: Model,
+    moment: Moment,
+    instant: Instant,
+    camera: Camera,
+    background: Tensor,
+    target: Tensor,
+    ssim_weight: float,
+    sh_degree: int | None = None,
+    tile_weights: Tensor | None = None,
+    counted: Tensor | None = None,
+    with_depth: bool = False,
+) -> tuple[Comparison, Frame]:
+    """Draw a moment, let the model shade the frame, compare; return the frame as well.
+
+    Arguments as in ``compare``; ``with_depth`` as in ``Engine.rasterize``.
+    """
+    frame = engine.rasterize(moment, camera, background, sh_degree, with_depth)
+    frame = model.shade(frame, instant)
+    return compare_frame(frame, target, ssim_weight, tile_weights, counted), frame
+
+
+def compare_frame(
+    frame: Frame,
+    target: Tensor,
+    ssim_weight: float,
+    tile_weights: Tensor | None = None,
+    counted: Tensor | None = None,
+) -> Comparison:
+    """Return what ``Comparing.compare`` does, of a frame that has been drawn.
+
+    Pixels that do not count are taken for right, also by the windows of SSIM.
+    """
+    rgb = frame.rgb
+    if counted is not None:
+        true = target.permute(1, 2, 0).to(rgb) / 255
+        rgb = torch.where(counted.to(rgb.device)[..., None], rgb, true)
+    errors = None if ssim_weight > 0 else tile_errors(rgb, target)
+    if errors is None or tile_weights is None:
+        loss = unweighted = photometric_loss(rgb, target, ssim_weight)
+    else:
+        errors = errors * (tile_weights > 0)
+        loss = ((errors * tile_weights).sum() / target.numel()).to(rgb.dtype)
+        unweighted = errors.sum() / target.numel()
+    (on_screen,) = torch.autograd.grad(unweighted, frame.means2d, retain_graph=True)
+    return Comparison(loss, on_screen, None if errors is None else errors.detach())

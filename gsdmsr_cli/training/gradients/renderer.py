@@ -1,0 +1,174 @@
+"""Renders views as the preset wants them at each phase of a training, and goes backward."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+
+import torch
+from torch import Tensor
+
+from gsdmsr_cli.gaussians.moment import Moment
+from gsdmsr_cli.ground.splatting_constants import tile_grid
+from gsdmsr_cli.model.layer import Instant
+from gsdmsr_cli.model.model import Model
+from gsdmsr_cli.options.preset import BACKGROUNDS, Preset
+from gsdmsr_cli.raster import ComparingViews, Engine
+from gsdmsr_cli.scene.camera import Camera
+from gsdmsr_cli.scene.pictures import HalvedPictures, Pictures, ResidentPictures
+from gsdmsr_cli.scene.scene import MASK, View
+from gsdmsr_cli.training.gradients.compare import (
+    compare,
+    compare_views,
+    draw_and_compare,
+    gradients_of,
+)
+from gsdmsr_cli.training.gradients.phase import Order, Phase, ViewGradients
+from gsdmsr_cli.training.losses import Seen, start_term
+
+
+class TrainingRenderer:
+    """Renders train views of a model and takes the gradients of their loss.
+
+    Attributes:
+        background: (3,) colour behind the splats, on the device.
+        terms: of the loss, beside the photometric one.
+    """
+
+    def __init__(
+        self,
+        preset: Preset,
+        engine: Engine,
+        pictures: Pictures,
+        views: Sequence[View],
+        device: torch.device | str = "cpu",
+    ) -> None:
+        self.preset, self.engine, self.pictures, self.views = preset, engine, pictures, views
+        self.background = torch.tensor(BACKGROUNDS[preset.data.background]).to(device)
+        self.terms = [start_term(settings) for settings in preset.losses.terms]
+        self._halved = HalvedPictures(pictures)
+        self._resident = ResidentPictures(torch.device(device), preset.data.cache_mib << 20)
+
+    def gradients(self, model: Model, orders: Sequence[Order], phase: Phase) -> list[ViewGradients]:
+        """Return what each of the ordered views says of the model.
+
+        Views are rendered at once if the engine can and their pictures are of one size.
+
+        Args:
+            model: what is rendered.
+            orders: tiles may be weighted only where ``tiles`` allows it.
+            phase: of the training.
+
+        Raises:
+            DataError: a view's picture cannot be read.
+        """
+        if any(term.weight(phase.progress) > 0 for term in self.terms) or model.shades:
+            return [self._with_terms(model, order, phase) for order in orders]
+        pictures, views = self._pictures(phase.progress), [self.views[o.row] for o in orders]
+        cameras = [pictures.camera(view) for view in views]
+        targets = [self._resident.load(pictures, view) for view in views]
+        masks = [pictures.signal(view, MASK) for view in views]
+        weights = [self._on_device(order.tile_weights) for order in orders]
+        instants = [
+            model.instant(view.time, camera, order.jitter)
+            for view, camera, order in zip(views, cameras, orders, strict=True)
+        ]
+        further = self._ssim_weight(phase.progress), self._sh_degree(phase.progress)
+        together = _alike(cameras, weights) and all(mask is None for mask in masks)
+        moments: Iterable[Moment] = (self._moved(model, [one], phase)[0] for one in instants)
+        if together and isinstance(self.engine, ComparingViews):
+            moments = at_once = self._moved(model, instants, phase)
+            if all(moment.features is None for moment in at_once):
+                given = self.engine, model, at_once, cameras, self.background, targets
+                return compare_views(*given, *further, weights)
+        return [
+            compare(
+                self.engine, model, moment, camera, self.background, target, *further, own, mask
+            )
+            for moment, camera, target, own, mask in zip(
+                moments, cameras, targets, weights, masks, strict=True
+            )
+        ]
+
+    def _with_terms(self, model: Model, order: Order, phase: Phase) -> ViewGradients:
+        """Draw, shade and compare a view, and add the further terms of the loss."""
+        pictures, view = self._pictures(phase.progress), self.views[order.row]
+        camera, target = pictures.camera(view), self._resident.load(pictures, view)
+        instant = model.instant(view.time, camera, order.jitter)
+        weights = [term.weight(phase.progress) for term in self.terms]
+        times = order.other_times or [None] * len(self.terms)
+        others = [
+            None if time is None or not weight > 0 else model.instant(time, camera, order.jitter)
+            for time, weight in zip(times, weights, strict=True)
+        ]
+        wanted = [instant, *(other for other in others if other is not None)]
+        moments = dict(zip(wanted, self._moved(model, wanted, phase), strict=True))
+        found, frame = draw_and_compare(
+            self.engine, model, moments[instant], instant, camera, self.background, target,
+            self._ssim_weight(phase.progress), self._sh_degree(phase.progress),
+            self._on_device(order.tile_weights), pictures.signal(view, MASK),
+            any(term.needs_depth for term in self.terms),
+        )  # fmt: skip
+        loss = found.loss
+        for term, weight, other in zip(self.terms, weights, others, strict=True):
+            if weight > 0:
+                then = None if other is None else moments[other]
+                moment = moments[instant]
+                seen = Seen(view, pictures, camera, target, frame, instant, moment, other, then)
+                loss = loss + weight * term(seen)
+        return ViewGradients(
+            loss.detach(), gradients_of(loss, model), found.on_screen,
+            (camera.width, camera.height), found.errors,
+        )  # fmt: skip
+
+    def other_times(
+        self, time: float, times: Sequence[float], generator: torch.Generator
+    ) -> tuple[float | None, ...]:
+        """Return the second time that each term wants for a view, see ``Term.other_time``."""
+        return tuple(term.other_time(time, times, generator) for term in self.terms)
+
+    def _moved(self, model: Model, instants: Sequence[Instant], phase: Phase) -> list[Moment]:
+        """Return the model at each of the instants, the very same where these are equal."""
+        if not phase.moving:
+            return [Moment(model.splats)] * len(instants)
+        distinct = list(dict.fromkeys(instants))
+        moved = model.at_instants(distinct, phase.gradient_mask)
+        by_instant = dict(zip(distinct, moved, strict=True))
+        return [by_instant[instant] for instant in instants]
+
+    def _on_device(self, tile_weights: Tensor | None) -> Tensor | None:
+        return None if tile_weights is None else tile_weights.to(self.background.device)
+
+    def tiles(self, view: View, progress: float) -> int:
+        """Return how many tiles a view's picture has, or 0 where they may not be chosen."""
+        if self._ssim_weight(progress) > 0:
+            return 0
+        camera = self.camera(view, progress)
+        return math.prod(tile_grid(camera.width, camera.height))
+
+    def camera(self, view: View, progress: float) -> Camera:
+        """Return the camera that a view is rendered under."""
+        return self._pictures(progress).camera(view)
+
+    def _pictures(self, progress: float) -> Pictures | HalvedPictures:
+        if progress < self.preset.training.low_resolution_until:
+            return self._halved
+        self._halved.release()
+        return self.pictures
+
+    def _ssim_weight(self, progress: float) -> float:
+        losses = self.preset.losses
+        return losses.ssim if progress < losses.ssim_until else 0.0
+
+    def _sh_degree(self, progress: float) -> int:
+        """Return the degree of colour; degree d joins at d times ``sh_start``."""
+        options = self.preset.splats
+        if options.sh_start <= 0:
+            return options.sh_degree
+        return min(options.sh_degree, int(progress / options.sh_start))
+
+
+def _alike(cameras: Sequence[Camera], tile_weights: Sequence[Tensor | None]) -> bool:
+    """Return whether views can be rendered together."""
+    sizes = {(camera.width, camera.height) for camera in cameras}
+    return len(sizes) == 1 and len({weights is None for weights in tile_weights}) == 1

@@ -1,0 +1,95 @@
+"""Terms of the training's loss, one file per term.
+
+The photometric loss (``ops.photometric``) is always there; where it stands alone, engines
+draw, compare and differentiate in one go. Further terms are named by a preset under
+``losses.terms``. A term is a module of this package with ``Options``, a frozen dataclass of its
+settings, and ``start(options) -> Term``. Terms never import one another.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import torch
+from torch import Tensor
+
+from gsdmsr_cli.gaussians.frame import Frame
+from gsdmsr_cli.gaussians.moment import Moment
+from gsdmsr_cli.ground import plugins
+from gsdmsr_cli.model.layer import Instant, options_of
+from gsdmsr_cli.scene.camera import Camera
+from gsdmsr_cli.scene.pictures import HalvedPictures, Pictures
+from gsdmsr_cli.scene.scene import View
+
+KIND = "term of the loss"
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """What a term is given of one view.
+
+    Attributes:
+        view: of the scene; ``pictures.signal(view, name)`` reads what it has beside its picture.
+        pictures: of the size that is drawn.
+        camera: of that size.
+        target: (3, H, W) uint8 true picture.
+        frame: what was drawn; its depth only if a term ``needs_depth``.
+        instant, moment: when, and what was drawn.
+        other_instant, other: the second instant that the term has chosen, and what the model is
+            then; None unless it has an ``other_time``.
+    """
+
+    view: View
+    pictures: Pictures | HalvedPictures
+    camera: Camera
+    target: Tensor
+    frame: Frame
+    instant: Instant
+    moment: Moment
+    other_instant: Instant | None = None
+    other: Moment | None = None
+
+
+class Term(ABC):
+    """A scalar that is added to the photometric loss of every view.
+
+    Attributes:
+        needs_depth: whether the frame is to have a depth.
+    """
+
+    needs_depth: ClassVar[bool] = False
+
+    def weight(self, progress: float) -> float:
+        """Return the factor of the term at ``progress`` in [0, 1]; with 0 it costs nothing."""
+        return 1.0
+
+    def other_time(
+        self, time: float, times: Sequence[float], generator: torch.Generator
+    ) -> float | None:
+        """Return a second time in [0, 1] at which the term wants the model, or None.
+
+        Args:
+            time: of the view.
+            times: distinct train times, ascending.
+            generator: source of random choices.
+        """
+        return None
+
+    @abstractmethod
+    def __call__(self, seen: Seen) -> Tensor:
+        """Return the value (), differentiable by what was drawn."""
+
+
+def start_term(settings: Mapping[str, Any]) -> Term:
+    """Make the term ``settings["name"]``, with the other settings as its options.
+
+    Raises:
+        UsageError: there is no such term, or an option is unknown or out of range.
+    """
+    options = options_of(__name__, settings)
+    module: Any = plugins.load(__name__, str(settings["name"]))
+    term: Term = module.start(options)
+    return term

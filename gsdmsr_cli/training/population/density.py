@@ -1,0 +1,150 @@
+"""Adaptive density control: clone, split and prune (3DGS, Kerbl et al. 2023, section 5)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from gsdmsr_cli.gaussians.splats import Splats
+from gsdmsr_cli.ground.errors import GsdmsrError
+from gsdmsr_cli.ground.geometry import quat_to_rotmat
+from gsdmsr_cli.options.preset import DensityOptions, Preset
+from gsdmsr_cli.training.population import Event, Tick
+from gsdmsr_cli.training.resizing import Population, Resize
+from gsdmsr_cli.training.statistics import DensityStatistics
+
+SPLIT_SHRINK = 1.6
+"""A split splat's children are this much smaller (3DGS: 0.8 times the two children)."""
+
+PRUNE_EVERY = 500
+"""Interval of pruning alone, once growing has ended [steps]."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """None of its own: see ``DensityOptions``."""
+
+
+class Density(Event):
+    """Clones, splits and prunes; once growing has ended, prunes alone.
+
+    Attributes:
+        rounds: how many times splats have grown.
+    """
+
+    def __init__(self, options: DensityOptions) -> None:
+        self.options = options
+        self.rounds = 0
+
+    def due(self, tick: Tick) -> bool:
+        """Return whether to grow and prune, or only to prune, after this step."""
+        o = self.options
+        if tick.step < o.start:
+            return False
+        if not self._growing(tick):
+            return tick.step % PRUNE_EVERY == 0
+        return tick.step % o.every == 0 and tick.progress * o.rounds >= self.rounds * o.until
+
+    def _growing(self, tick: Tick) -> bool:
+        return tick.progress < self.options.until
+
+    def apply(self, population: Population, tick: Tick) -> Resize:
+        """Grow and prune.
+
+        Raises:
+            GsdmsrError: no splat is left.
+        """
+        growing = self._growing(tick)
+        self.rounds += growing
+        model, given = population.model, (population.radius, growing, population.generator)
+        rows, fresh, grown = grow_and_prune(
+            model.splats, population.statistics, self.options, *given
+        )
+        if not len(rows):
+            raise GsdmsrError(
+                f"no splats are left at step {tick.step}; lower density.prune_opacity or "
+                "check that cameras and pictures belong together"
+            )
+        population.statistics.clear()
+        return Resize(rows, fresh, grown)
+
+    def state(self) -> dict[str, Any]:
+        """Return how often splats have grown."""
+        return {"rounds": self.rounds}
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Return to what ``state`` returned."""
+        self.rounds = int(state["rounds"])
+
+
+def start(options: Options, preset: Preset) -> Density:
+    """Return density control as the preset wants it."""
+    return Density(preset.density)
+
+
+@torch.no_grad()
+def grow_and_prune(
+    splats: Splats,
+    statistics: DensityStatistics,
+    options: DensityOptions,
+    radius: float,
+    growing: bool,
+    generator: torch.Generator,
+) -> tuple[Tensor, Tensor, Splats]:
+    """Decide which splats go on, and which are cloned and split.
+
+    Args:
+        splats: N canonical splats.
+        statistics: their gradients since the last call.
+        options: thresholds.
+        radius: the scene's radius [world units].
+        growing: whether splats may be cloned and split, or only pruned.
+        generator: source of the split children's positions.
+
+    Returns:
+        rows (M,), the parent of each new row; fresh (M,) bool, whether the row is a clone or a
+        child; and the M new splats, with the children moved and shrunk.
+    """
+    largest = splats.log_scales.exp().amax(dim=1)
+    kept = torch.sigmoid(splats.logit_opacities) >= options.prune_opacity
+    kept &= largest <= options.prune_scale * radius
+    for tensor in splats.tensors().values():
+        kept &= tensor.isfinite().reshape(len(splats), -1).all(dim=1)
+    wanted = _chosen(statistics, options, int(kept.sum())) if growing else torch.zeros_like(kept)
+    grows = kept & wanted
+    split = grows & (largest > options.split_scale * radius)
+    survivors, clones = kept & ~split, grows & ~split
+    children = split.nonzero().flatten().repeat(2)
+    rows = torch.cat([survivors.nonzero().flatten(), clones.nonzero().flatten(), children])
+    fresh = torch.arange(len(rows), device=rows.device) >= int(survivors.sum())
+    grown = splats.detach().take(rows)
+    if len(children):
+        _scatter_children(grown, len(children), generator)
+    return rows, fresh, grown
+
+
+def _chosen(statistics: DensityStatistics, options: DensityOptions, kept: int) -> Tensor:
+    """Return which splats have a large gradient, the largest first if the cap leaves few places."""
+    mean = statistics.mean()
+    chosen = mean >= options.gradient
+    room = max(options.cap - kept, 0)
+    if int(chosen.sum()) > room:
+        best = mean.argsort(descending=True, stable=True)[:room]
+        chosen = torch.zeros_like(chosen)
+        chosen[best] = True
+    return chosen
+
+
+def _scatter_children(grown: Splats, count: int, generator: torch.Generator) -> None:
+    """Draw the last ``count`` means from their parents' Gaussians and shrink them, in place."""
+    children = slice(len(grown) - count, None)
+    scales = grown.log_scales[children].exp()
+    noise = torch.randn(count, 3, generator=generator).to(scales) * scales
+    turned = quat_to_rotmat(grown.quats[children]) @ noise[:, :, None]
+    grown.means[children] += turned[:, :, 0]
+    grown.log_scales[children] -= math.log(SPLIT_SHRINK)

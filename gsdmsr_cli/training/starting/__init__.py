@@ -1,0 +1,1 @@
+"""The splats that a training starts from."""

@@ -1,0 +1,114 @@
+"""Makes the initial splats from the scene's points or from random ones, and the layers' facts."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from gsdmsr_cli.gaussians.splats import Splats
+from gsdmsr_cli.ground.geometry import SH_C0
+from gsdmsr_cli.model.layer import Facts
+from gsdmsr_cli.ops.neighbours.cpu import mean_squares
+from gsdmsr_cli.ops.planes import Box, Corner
+from gsdmsr_cli.options.preset import SplatOptions
+from gsdmsr_cli.scene.pictures import Pictures
+from gsdmsr_cli.scene.scene import Scene
+from gsdmsr_cli.training.starting import silhouettes, surfaces
+from gsdmsr_cli.training.starting.sightings import Points, colours_of
+
+NEIGHBOURS = 3
+
+STRAYS, MARGIN = 0.01, 0.075
+"""Share of the first splats that may lie beyond each side of the motion's box, and what is added
+to the box on each side, in units of its edge."""
+
+
+def initial_splats(
+    scene: Scene,
+    options: SplatOptions,
+    pictures: Pictures,
+    background: Tensor,
+    generator: torch.Generator,
+) -> Splats:
+    """Return isotropic splats as large as the distance to their neighbours (3DGS, section 5.1).
+
+    They sit at the scene's own points. Where there are none, or the start is "surfaces" and there
+    are fewer than ``options.count``, others join them as ``options.start`` says: at random in the
+    box and nearly grey, as all methods do on D-NeRF; where silhouettes overlap; or on surfaces.
+    """
+    given = _given_points(scene, pictures)
+    wanted = options.count - len(given.means)
+    if not len(given.means) or (options.start == "surfaces" and wanted > 0):
+        more = _new_points(scene, options.start, wanted, pictures, background, generator)
+        given = Points(*map(torch.cat, zip(given, more, strict=True)))
+    means, colours = given
+    n = len(means)
+    sh = torch.zeros(n, (options.sh_degree + 1) ** 2, 3)
+    sh[:, 0] = (colours - 0.5) / SH_C0
+    quats = torch.zeros(n, 4)
+    quats[:, 0] = 1
+    return Splats(
+        means=means,
+        quats=quats,
+        log_scales=_spacing(means, scene.bound).log()[:, None].repeat(1, 3),
+        logit_opacities=torch.full((n,), math.log(options.opacity / (1 - options.opacity))),
+        sh=sh,
+    )
+
+
+def _given_points(scene: Scene, pictures: Pictures) -> Points:
+    """Return the scene's points, coloured from the pictures if the format has no colours."""
+    means = torch.from_numpy(scene.points)
+    if scene.colours is None:
+        return Points(means, colours_of(means, scene, pictures))
+    return Points(means, torch.from_numpy(scene.colours))
+
+
+def _new_points(
+    scene: Scene,
+    start: str,
+    count: int,
+    pictures: Pictures,
+    background: Tensor,
+    generator: torch.Generator,
+) -> Points:
+    if start == "silhouettes":
+        return silhouettes.sample_points(scene, pictures, background, count, generator)
+    if start == "surfaces":
+        return surfaces.sample_points(scene, pictures, count, generator)
+    means = (2 * torch.rand(count, 3, generator=generator) - 1) * scene.bound
+    return Points(means, 0.5 + SH_C0 * torch.rand(count, 3, generator=generator) / 255)
+
+
+def _spacing(means: Tensor, bound: float) -> Tensor:
+    """Return the root mean square distance of each mean to its three nearest neighbours (N,)."""
+    count = min(NEIGHBOURS, len(means) - 1)
+    if count < 1:
+        return torch.full((len(means),), 0.1 * bound)
+    squares = torch.from_numpy(mean_squares(means.double().numpy(), count))
+    return squares.clamp(min=1e-7).sqrt().float()
+
+
+def facts_of(scene: Scene, splats: Splats) -> Facts:
+    """Return what a motion may know of the scene, which ``splats`` are about to represent."""
+    return Facts(scene.bound, _box(splats.means, scene.bound), len(scene.train_times))
+
+
+def _box(means: Tensor, bound: float) -> Box:
+    """Return the box that holds all but the outermost of the means, and some more.
+
+    4D-GS's code gives its grid the box of the first cloud as well. Random starts have strays,
+    hence the quantiles; what ends up outside moves like the border.
+    """
+    means = means.double()
+    lower, upper = means.quantile(STRAYS, 0), means.quantile(1 - STRAYS, 0)
+    half = ((upper - lower) * (0.5 + MARGIN)).clamp(min=0.01 * bound)
+    centre = (lower + upper) / 2
+    return _corner(centre - half), _corner(centre + half)
+
+
+def _corner(point: Tensor) -> Corner:
+    x, y, z = point.tolist()
+    return x, y, z

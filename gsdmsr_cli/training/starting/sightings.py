@@ -1,0 +1,55 @@
+"""Projects points to the train views and reads their colours there."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from gsdmsr_cli.scene.camera import Camera
+from gsdmsr_cli.scene.pictures import Pictures
+from gsdmsr_cli.scene.scene import Scene
+
+VIEWS = 40
+"""Most views from which the colours of points are read, evenly spaced."""
+
+
+class Points(NamedTuple):
+    """Points to start from.
+
+    Attributes:
+        means: (P, 3) [world units].
+        colours: (P, 3) in [0, 1].
+    """
+
+    means: Tensor
+    colours: Tensor
+
+
+def places(points: Tensor, camera: Camera) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the columns and rows [px] of points (P, 3), and whether the picture shows them."""
+    rotation = torch.as_tensor(camera.rotation, dtype=points.dtype)
+    at = points @ rotation.T + torch.as_tensor(camera.translation, dtype=points.dtype)
+    depth = at[:, 2].clamp(min=1e-6)
+    column = at[:, 0] / depth * camera.fx + camera.cx
+    row = at[:, 1] / depth * camera.fy + camera.cy
+    across = (column >= 0) & (column < camera.width)
+    return column, row, (at[:, 2] > 0) & across & (row >= 0) & (row < camera.height)
+
+
+def colours_of(points: Tensor, scene: Scene, pictures: Pictures) -> Tensor:
+    """Return the mean colour of the pixels that points (P, 3) fall on, (P, 3) in [0, 1].
+
+    What hides a point counts as well, for want of knowing it; points that no view shows are grey.
+    """
+    if not len(points):
+        return torch.zeros(0, 3)
+    views = scene.split("train")
+    total, seen = torch.zeros(len(points), 3), torch.zeros(len(points), 1)
+    for view in views[:: -(-len(views) // VIEWS)]:
+        column, row, shown = places(points, pictures.camera(view))
+        pixels = pictures.load(view)[:, row[shown].long(), column[shown].long()]
+        total[shown] += pixels.T.float() / 255
+        seen[shown] += 1
+    return torch.where(seen > 0, total / seen.clamp(min=1), 0.5)

@@ -1,0 +1,65 @@
+"""How kernels are compiled: where they are kept."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+FOLDER = "import numba; from gsdmsr_cli.backends.cpu import jit; print(numba.config.CACHE_DIR)"
+
+
+@pytest.mark.parametrize("first", ["", "import gsdmsr_cli.ops.rasterize.cpu.blending; "])
+def test_kernels_are_kept_by_the_hash_of_all_sources_whoever_imports_numba_first(
+    first: str,
+) -> None:
+    free = {name: value for name, value in os.environ.items() if name != "NUMBA_CACHE_DIR"}
+    command = [sys.executable, "-c", first + FOLDER]
+    folder = subprocess.run(command, env=free, check=True, capture_output=True, text=True).stdout
+    assert len(Path(folder.strip()).name) == 16
+
+
+def test_a_folder_that_the_user_names_is_used(tmp_path: Path) -> None:
+    named = dict(os.environ, NUMBA_CACHE_DIR=str(tmp_path))
+    command = [sys.executable, "-c", FOLDER]
+    folder = subprocess.run(command, env=named, check=True, capture_output=True, text=True).stdout
+    assert folder.strip() == str(tmp_path)
+
+
+IN_A_NEW_PROCESS = """
+import json, sys
+import numpy as np
+from gsdmsr_cli.ops.rasterize.cpu import binning
+
+order = binning.depth_order(np.ones(2, np.float32), np.ones(2, np.int32))
+assert order.tolist() == [0, 1]
+stats = binning.depth_order.stats, binning._sorted_rows.stats
+print(json.dumps([[sum(s.cache_hits.values()), sum(s.cache_misses.values())] for s in stats]))
+"""
+
+
+def compiled_in(cache: Path, code: str = IN_A_NEW_PROCESS) -> list[list[int]]:
+    """Return how often a new process has found each of two kernels in the cache, and missed it."""
+    named = dict(os.environ, NUMBA_CACHE_DIR=str(cache))
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=named, check=True, capture_output=True, text=True
+    )
+    found: list[list[int]] = json.loads(done.stdout)
+    return found
+
+
+def test_a_process_compiles_nothing_itself(tmp_path: Path) -> None:
+    """Neither what it calls nor what that calls, whether or not there is a cache already."""
+    assert [compiled_in(tmp_path) for _ in "12"] == [[[1, 0], [0, 0]]] * 2
+    assert len(list(tmp_path.rglob("*.depth_order-*.nbc"))) == 1
+    assert len(list(tmp_path.rglob("*._sorted_rows-*.nbc"))) == 1
+
+
+def test_a_process_compiles_what_no_other_can(tmp_path: Path) -> None:
+    unable = "import sys; sys.executable = ''" + IN_A_NEW_PROCESS
+    assert compiled_in(tmp_path, unable) == [[0, 1], [0, 1]]
+    assert compiled_in(tmp_path) == [[1, 0], [0, 0]]

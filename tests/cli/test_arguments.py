@@ -1,0 +1,169 @@
+"""What each command is called with, for the options on its line."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from gsdmsr_cli.benchmark.trials import Terms
+from gsdmsr_cli.evaluation.request import Demands, Output
+from gsdmsr_cli.evaluation.request import Request as Evaluation
+from gsdmsr_cli.exports import format_names
+from gsdmsr_cli.filming.request import Request
+from gsdmsr_cli.ground.errors import UsageError
+from gsdmsr_cli.options.preset import load_preset
+
+Gsdmsr = Any  # the fixture of conftest.py
+
+
+@pytest.mark.parametrize(
+    ("line", "name", "arguments"),
+    [
+        (
+            "train --data d --out r",
+            "train",
+            (Path("d"), Path("r"), None, None, [], "auto", False, False),
+        ),
+        (
+            "train --data d --out r --preset dnerf --config f.yaml --set a.b=1 --set a.c=2"
+            " --device cpu --resume",
+            "train",
+            (Path("d"), Path("r"), "dnerf", Path("f.yaml"), ["a.b=1", "a.c=2"], "cpu", True, False),
+        ),
+        ("eval r", "eval", (Path("r"), Evaluation(), Demands(), Output(), None)),
+        (
+            "eval r --split val --background both --downscale 2 --lpips-weights w --lpips-inria"
+            " --json --fail-under psnr=25 --fail-under ssim=0.9 --fail-over lpips_alex=0.1"
+            " --baseline b.json --tolerance psnr=0.5 --junit j.xml --github-summary --out o"
+            " --report --data d",
+            "eval",
+            (
+                Path("r"),
+                Evaluation("val", "both", 2, Path("w"), True),
+                Demands(
+                    ("psnr=25", "ssim=0.9"), ("lpips_alex=0.1",), Path("b.json"), ("psnr=0.5",)
+                ),
+                Output(Path("o"), True, Path("j.xml"), True, True),
+                Path("d"),
+            ),
+        ),
+        ("render r", "render", (Path("r"), Request(), None, None)),
+        (
+            "render r --path orbit --frames 9 --out o --data d",
+            "render",
+            (Path("r"), Request("orbit", 9), Path("o"), Path("d")),
+        ),
+        (
+            "render r --path interpolate --view a --view test/b --time 0.5 --fps 24"
+            " --output depth,rgb --video webm,mp4 --size 64x32 --supersample 2 --overwrite",
+            "render",
+            (
+                Path("r"),
+                Request(
+                    "interpolate",
+                    None,
+                    ("a", "test/b"),
+                    0.5,
+                    24.0,
+                    ("rgb", "depth"),
+                    ("webm", "mp4"),
+                    (64, 32),
+                    None,
+                    2,
+                    True,
+                ),
+                None,
+                None,
+            ),
+        ),
+        (
+            "render r --video none --scale 0.5",
+            "render",
+            (Path("r"), Request(videos=(), scale=0.5), None, None),
+        ),
+        (
+            "export r --format ply --time 0.5 --out o",
+            "export",
+            (Path("r"), "ply", 0.5, None, [], Path("o")),
+        ),
+        (
+            "export r --format ply-sequence --frames 3 --out o",
+            "export",
+            (Path("r"), "ply-sequence", None, 3, [], Path("o")),
+        ),
+        (
+            "export r --format ply --set time=0.5 --set a=1 --out o",
+            "export",
+            (Path("r"), "ply", None, None, ["time=0.5", "a=1"], Path("o")),
+        ),
+        ("demo", "demo", (Path("gsdmsr-demo"),)),
+        ("doctor --json", "doctor", (True,)),
+        ("weights", "weights", ([], None, None, False)),
+        (
+            "weights --fetch vgg --fetch alex --to o --lpips-weights w --json",
+            "weights",
+            (["vgg", "alex"], Path("o"), Path("w"), True),
+        ),
+        ("benchmark kernels --yardstick y --json", "benchmark_kernels", (Path("y"), "cpu", True)),
+        ("benchmark kernels --device cuda", "benchmark_kernels", (None, "cuda", False)),
+        (
+            "benchmark scenes a --out o --steps 9",
+            "benchmark_scenes",
+            ([Path("a")], Path("o"), ["dnerf"], [9], [0], Terms(1, "white", "test", None), False),
+        ),
+        (
+            "benchmark scenes a b --out o --preset static --preset dnerf --budget 2m --budget 8m"
+            " --seed 1 --seed 2 --downscale 2 --background black --split val --lpips-weights w"
+            " --jobs 2 --json",
+            "benchmark_scenes",
+            (
+                [Path("a"), Path("b")],
+                Path("o"),
+                ["static", "dnerf"],
+                ["2m", "8m"],
+                [1, 2],
+                Terms(2, "black", "val", Path("w"), 2),
+                True,
+            ),
+        ),
+    ],
+)
+def test_commands_get_typed_arguments(
+    line: str, name: str, arguments: tuple[Any, ...], gsdmsr: Gsdmsr
+) -> None:
+    assert gsdmsr(line) == 0
+    assert gsdmsr.calls == [(name, arguments)]
+
+
+def test_every_exporter_is_offered(gsdmsr: Gsdmsr) -> None:
+    assert {"ply", "ply-sequence"} <= set(format_names())
+    for name in format_names():
+        assert gsdmsr(f"export r --format {name} --out o") == 0
+        assert gsdmsr.calls[-1] == ("export", (Path("r"), name, None, None, [], Path("o")))
+
+
+def overrides_of(gsdmsr: Gsdmsr, options: str) -> list[str]:
+    assert gsdmsr(f"train --data d --out r {options}") == 0
+    overrides = gsdmsr.calls[-1][1][4]
+    assert isinstance(overrides, list)
+    return overrides
+
+
+def test_the_convenience_options_of_train_become_overrides(gsdmsr: Gsdmsr) -> None:
+    options = "--budget 8m --downscale 2 --background black --seed 7 --threads 3"
+    preset = load_preset(None, None, overrides_of(gsdmsr, f"--set training.seed=5 {options}"))
+    assert (preset.training.budget, preset.training.seed, preset.training.threads) == ("8m", 7, 3)
+    assert (preset.data.downscale, preset.data.background) == (2, "black")
+
+
+def test_steps_put_an_end_to_a_budget(gsdmsr: Gsdmsr) -> None:
+    overrides = overrides_of(gsdmsr, "--set training.budget=8m --steps 50")
+    training = load_preset(None, None, overrides).training
+    assert (training.steps, training.budget) == (50, None)
+
+
+def test_a_budget_without_a_unit_is_refused_as_text(gsdmsr: Gsdmsr) -> None:
+    with pytest.raises(UsageError, match='budget is "8"; allowed: null'):
+        load_preset(None, None, overrides_of(gsdmsr, "--budget 8"))

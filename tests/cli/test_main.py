@@ -1,0 +1,159 @@
+"""The command line as a whole: help, version, and how every error and signal ends."""
+
+from __future__ import annotations
+
+import errno
+import subprocess
+import sys
+import time
+from typing import Any
+
+import pytest
+import torch
+import typer
+
+from gsdmsr_cli import __version__
+from gsdmsr_cli.ground.errors import DataError, GsdmsrError, ThresholdError, UsageError
+
+Gsdmsr = Any  # the fixture of conftest.py
+
+
+def python(*arguments: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, *arguments], capture_output=True, text=True, timeout=60, check=False
+    )
+
+
+def test_the_package_runs_as_a_module() -> None:
+    done = python("-m", "gsdmsr_cli", "--version")
+    assert (done.returncode, done.stdout, done.stderr) == (0, f"gsdmsr {__version__}\n", "")
+    assert python("-m", "gsdmsr_cli", "trian").returncode == 2
+
+
+def test_help_is_fast_and_lists_every_command() -> None:
+    python("-m", "gsdmsr_cli", "--help")  # the first run may compile
+    start = time.perf_counter()
+    done = python("-m", "gsdmsr_cli", "--help")
+    # about 0.25 s on an idle machine; the bound allows for a busy one
+    assert time.perf_counter() - start < 2.0
+    assert done.returncode == 0
+    for name in ("train", "eval", "render", "export", "demo", "doctor", "benchmark"):
+        assert name in done.stdout
+
+
+def test_the_command_line_imports_nothing_heavy() -> None:
+    heavy = ("torch", "numpy", "numba", "cv2", "yaml")
+    done = python(
+        "-c", f"import gsdmsr_cli.cli.main, sys; print([m for m in {heavy} if m in sys.modules])"
+    )
+    assert done.stdout.strip() == "[]"
+
+
+def test_version(gsdmsr: Gsdmsr, capsys: pytest.CaptureFixture[str]) -> None:
+    assert gsdmsr("--version") == 0
+    assert capsys.readouterr().out == f"gsdmsr {__version__}\n"
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("--foo", "--foo"),
+        ("trian", "trian"),
+        ("train --out r", "--data"),
+        ("train --data d --out r --step 3", "--steps"),
+        ("train --data d --out r --steps x", "--steps"),
+        ("train --data d --out r --device tpu", "--device"),
+        ("train --data d --out r --steps 3 --budget 8m", "--budget and --steps"),
+        ("train --data d --out r --resume --overwrite", "--resume and --overwrite"),
+        ("eval", "RUN"),
+        ("eval r --split train", "--split"),
+        ("eval r --downscale 0", "--downscale"),
+        ("render r --frames 0", "--frames"),
+        ("render r --output rgb,dept", "--output: unknown 'dept'; did you mean 'depth'?"),
+        ("render r --output ,", "--output: unknown ''"),
+        ("render r --video mp3", "--video: unknown 'mp3'; did you mean 'mp4'?"),
+        ("render r --size 400", "--size is '400'; allowed: WxH"),
+        ("render r --size 0x4", "--size is '0x4'; allowed: WxH"),
+        ("render r --size 99999x4", "both 1 to 16384 px"),
+        ("render r --size 4x4 --scale 2", "--size and --scale"),
+        ("render r --scale 0", "--scale is 0; allowed: more than 0"),
+        ("render r --scale nan", "--scale is nan; allowed"),
+        ("render r --fps 0", "--fps is 0; allowed"),
+        ("render r --time 1.5", "--time"),
+        ("render r --supersample 9", "--supersample"),
+        ("render r --path still --time 0.5", "--path still stops the camera; drop one"),
+        ("render r --output flow --frames 1", "--frames 1 has no next"),
+        ("render r --view a", "--view needs a --path"),
+        ("export r --format obj --out o", "--format"),
+        ("export r --format ply --time 1.5 --out o", "--time"),
+        ("benchmark", "missing command"),
+        ("benchmark scenes --out o --steps 3", "SCENE"),
+        ("benchmark scenes a --out o", "--budget 8m or --steps N"),
+        ("doctor extra", "extra"),
+        ("weights --to o", "--to is where --fetch downloads to"),
+    ],
+)
+def test_usage_errors_are_one_line_and_exit_2(
+    line: str, message: str, gsdmsr: Gsdmsr, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert gsdmsr(line) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("error: ")
+    assert error.count("\n") == 1
+    assert message in error
+    assert gsdmsr.calls == []
+
+
+@pytest.mark.parametrize(
+    ("failure", "code", "message"),
+    [
+        (GsdmsrError("general"), 1, "general"),
+        (UsageError("two\nlines"), 2, "two lines"),
+        (DataError("d/x.png: truncated"), 3, "d/x.png: truncated"),
+        (ThresholdError("psnr"), 4, "psnr"),
+        (
+            OSError(errno.ENOSPC, "No space left on device", "r/a"),
+            3,
+            "r/a: No space left on device; free space or choose another place",
+        ),
+        (
+            PermissionError(errno.EACCES, "Permission denied"),
+            3,
+            "Permission denied; free space or choose another place",
+        ),
+        (
+            torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB"),
+            3,
+            "the GPU's memory is full; lower --set density.cap=..., raise --downscale, lower --set "
+            "data.cache_mib=..., or use --device cpu",
+        ),
+        (
+            ZeroDivisionError("division by zero"),
+            1,
+            "internal: ZeroDivisionError: division by zero (set GSDMSR_DEBUG=1 for the traceback)",
+        ),
+    ],
+)
+def test_failures_are_one_line_and_their_code(
+    failure: Exception, code: int, message: str, gsdmsr: Gsdmsr, capsys: pytest.CaptureFixture[str]
+) -> None:
+    gsdmsr.failure = failure
+    assert gsdmsr("doctor --json") == code
+    assert capsys.readouterr() == ("", f"error: {message}\n")
+
+
+@pytest.mark.parametrize("failure", [KeyboardInterrupt(), typer.Abort()])
+def test_an_interrupt_exits_130(failure: BaseException, gsdmsr: Gsdmsr) -> None:
+    gsdmsr.failure = failure
+    assert gsdmsr("doctor") == 130
+
+
+def test_debug_shows_the_traceback(
+    gsdmsr: Gsdmsr, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("GSDMSR_DEBUG", "1")
+    gsdmsr.failure = ZeroDivisionError("division by zero")
+    assert gsdmsr("doctor") == 1
+    error = capsys.readouterr().err
+    assert "Traceback" in error
+    assert error.splitlines()[-1].startswith("error: internal: ZeroDivisionError")

@@ -1,0 +1,446 @@
+"""What every motion must keep to, over all files of the folder, and what is each one's own."""
+
+from __future__ import annotations
+
+import copy
+from functools import cache
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from kernel_checks import generator
+from motion_checks import (
+    FACTS,
+    are_among,
+    disturbed,
+    model_of,
+    moved_by,
+    penalty_of,
+    splats_of,
+    start_motion,
+    started,
+)
+from torch import Tensor
+
+from gsdmsr_cli.gaussians.moment import Moment
+from gsdmsr_cli.gaussians.splats import Splats
+from gsdmsr_cli.ground import plugins
+from gsdmsr_cli.ground.errors import UsageError
+from gsdmsr_cli.model import motion as motions
+from gsdmsr_cli.model.layer import Facts, Instant, Layer, options_of
+from gsdmsr_cli.ops.planes import CUBE
+from gsdmsr_cli.training.rates import NAMED
+
+TIMES = (0.0, 0.3, 1.0)
+COUNT = 7
+
+every_motion = pytest.mark.parametrize("name", plugins.names(motions.__name__))
+every_grid = pytest.mark.parametrize("name", ["hexplane", "multiscale", "control_points"])
+
+
+WRONG = (
+    ("levels", [], "1 to 8 whole numbers, each 2 or more"),
+    ("levels", [16] * 9, "1 to 8 whole numbers, each 2 or more"),
+    ("levels", [16, 1], "1 to 8 whole numbers, each 2 or more"),
+    ("channels", 0, "a multiple of 16, 16 or more"),
+    ("channels", 24, "a multiple of 16, 16 or more"),
+    ("width", 8, "a multiple of 16, 16 or more"),
+)
+"""Options that no kernel serves, and what is allowed."""
+
+
+def assert_equal(found: Splats, expected: Splats, **tolerance: float) -> None:
+    for name, tensor in found.tensors().items():
+        truth = expected.tensors()[name]
+        if tolerance:
+            torch.testing.assert_close(tensor, truth, **tolerance, msg=name)
+        else:
+            assert torch.equal(tensor, truth), name
+
+
+@cache
+def learnt(name: str) -> Layer:
+    """Return a motion that moves; to be copied by whoever resizes it."""
+    return disturbed(started(name, COUNT))
+
+
+def weighted_sum(splats: Splats) -> Tensor:
+    """Return a scalar that depends on every value of the splats, each with its own weight."""
+    rng, parts = generator(5), []
+    for tensor in splats.tensors().values():
+        parts.append((tensor * torch.randn(tensor.shape, generator=rng)).sum())
+    return torch.stack(parts).sum()
+
+
+def taken(motion: Layer, rows: Tensor) -> None:
+    """Let a motion follow a resize without clones or children."""
+    motion.take(rows, torch.zeros_like(rows, dtype=torch.bool))
+
+
+def test_the_known_motions_are_found() -> None:
+    assert {"static", "hexplane", "multiscale", "control_points"} <= set(
+        plugins.names(motions.__name__)
+    )
+
+
+@every_motion
+def test_starts_as_the_identity(name: str) -> None:
+    splats = splats_of(COUNT)
+    for progress in (0.0, 1.0):
+        motion = started(name, COUNT)
+        motion.advance(progress)
+        for time in TIMES:
+            moved = moved_by(motion, splats, time)
+            if motion.identity_at_start:
+                assert_equal(moved, splats)
+            assert len(moved) == COUNT
+
+
+def test_every_motion_so_far_says_that_it_starts_as_the_identity() -> None:
+    known = ("static", "hexplane", "multiscale", "control_points")
+    assert all(started(name).identity_at_start for name in known)
+
+
+@every_motion
+def test_several_times_at_once_are_those_times_to_the_last_bit(name: str) -> None:
+    motion, splats = disturbed(started(name, COUNT)), splats_of(COUNT)
+    instants = [Instant(time) for time in TIMES]
+    for progress in (0.0, 1.0):
+        motion.advance(progress)
+        found = motion.at_instants(Moment(splats), instants)
+        for time, moment in zip(TIMES, found, strict=True):
+            assert_equal(moment.splats, moved_by(motion, splats, time))
+            assert moment.axes is None and moment.features is None
+    taken(motion, torch.arange(0))
+    found = motion.at_instants(Moment(splats_of(0)), instants)
+    assert [len(moment) for moment in found] == [0, 0, 0]
+
+
+@every_motion
+def test_moves_once_it_has_learnt(name: str) -> None:
+    """So that the other tests compare something; only ``static`` has nothing to learn."""
+    splats = splats_of(COUNT)
+    motion = disturbed(started(name, COUNT))
+    at_times = [moved_by(motion, splats, time) for time in TIMES]
+    assert all(t.isfinite().all() for moved in at_times for t in moved.tensors().values())
+    assert (name == "static") == all(torch.equal(m.means, splats.means) for m in at_times)
+    assert (name == "static") == (not motion.tensors())
+
+
+@every_motion
+@given(rows=st.lists(st.integers(0, COUNT - 1), max_size=20), time=st.floats(0, 1, width=32))
+@settings(max_examples=15, deadline=None)
+def test_resize_then_move_is_move_then_resize(name: str, rows: list[int], time: float) -> None:
+    """Rows may repeat (clone, split), be absent (prune) or change places (reorder)."""
+    wanted = torch.tensor(rows, dtype=torch.long)
+    splats, motion = splats_of(COUNT), copy.deepcopy(learnt(name))
+    expected = moved_by(motion, splats, time).take(wanted)
+    taken(motion, wanted)
+    assert_equal(moved_by(motion, splats.take(wanted), time), expected, atol=1e-6, rtol=1e-6)
+
+
+@every_motion
+def test_gradients_reach_everything_that_is_trained(name: str) -> None:
+    splats = splats_of(50).map(torch.nn.Parameter)
+    motion = disturbed(started(name, 50))
+    trained = {p.name: p.tensor for p in motion.parameters() if p.rate is not None}
+    loss = torch.stack([weighted_sum(moved_by(motion, splats, time)) for time in TIMES]).sum()
+    loss.backward()
+    for what, tensor in {**splats.tensors(), **trained}.items():
+        assert tensor.requires_grad, what
+        assert tensor.grad is not None and tensor.grad.isfinite().all(), what
+        assert tensor.grad.any(), what
+
+
+@every_motion
+def test_parameters_have_names_of_their_own_and_learning_rates(name: str) -> None:
+    parameters = started(name, COUNT).parameters()
+    assert len({parameter.name for parameter in parameters}) == len(parameters)
+    for parameter in parameters:
+        own = isinstance(parameter.rate, tuple)
+        assert parameter.rate is None or own or parameter.rate in NAMED, parameter.name
+        assert parameter.tensor.requires_grad == (parameter.rate is not None), parameter.name
+        assert parameter.tensor.is_contiguous(), parameter.name
+        assert not parameter.per_splat or len(parameter.tensor) == COUNT, parameter.name
+
+
+@every_motion
+def test_penalty_is_a_finite_scalar_that_can_be_learnt_from(name: str) -> None:
+    motion = disturbed(started(name, COUNT))
+    penalty = penalty_of(motion, splats_of(COUNT), 0.4, generator())
+    if penalty is None:
+        return
+    assert penalty.shape == () and penalty.isfinite() and penalty > 0
+    penalty.backward()
+    assert any(t.grad is not None and t.grad.any() for t in motion.tensors().values())
+
+
+@every_motion
+def test_tensors_keep_their_names_and_order(name: str) -> None:
+    motion = started(name, COUNT)
+    before = list(motion.tensors())
+    assert list(disturbed(started(name, COUNT)).tensors()) == before
+    moved_by(motion, splats_of(COUNT), 0.5)
+    taken(motion, torch.tensor([0, 2]))
+    assert list(motion.tensors()) == before
+
+
+@every_motion
+def test_an_unknown_option_is_refused_with_the_nearest(name: str) -> None:
+    with pytest.raises(UsageError, match="no_such_option"):
+        started(name, no_such_option=3)
+
+
+def test_a_misspelt_option_or_name_is_answered_with_the_nearest() -> None:
+    with pytest.raises(UsageError, match=r"chanels.*did you mean 'channels'"):
+        started("hexplane", chanels=16)
+    with pytest.raises(UsageError, match=r"unknown motion 'hexplan'; did you mean 'hexplane'\?"):
+        started("hexplan")
+    with pytest.raises(UsageError, match="unknown motion ''"):
+        start_motion({}, FACTS, 1)
+
+
+@every_grid
+def test_times_outside_are_those_at_the_ends(name: str) -> None:
+    splats, motion = splats_of(COUNT), disturbed(started(name))
+    assert_equal(moved_by(motion, splats, 1.6), moved_by(motion, splats, 1.0))
+    assert_equal(moved_by(motion, splats, -0.5), moved_by(motion, splats, 0.0))
+
+
+@every_grid
+@pytest.mark.parametrize("time", [0.0, 1.0])
+def test_time_is_mapped_over_the_whole_grid(name: str, time: float) -> None:
+    """At either end of time only that end of the temporal planes is read."""
+    motion = disturbed(started(name))
+    weighted_sum(moved_by(motion, splats_of(COUNT), time)).backward()
+    planes = {n: t.grad for n, t in motion.tensors().items() if n.endswith(".time")}
+    assert planes
+    end = -1 if time else 0
+    for what, gradient in planes.items():
+        assert gradient is not None, what
+        read = gradient.abs().sum(dim=(0, 1, 3, 4)) > 0
+        assert read[end] and int(read.sum()) == 1, what
+
+
+@pytest.mark.parametrize("name", ["hexplane", "multiscale"])
+def test_detach_keeps_the_field_out_of_the_positions_gradient(name: str) -> None:
+    splats = splats_of(COUNT).map(torch.nn.Parameter)
+    motion = disturbed(started(name, detach=True))
+    moved_by(motion, splats, 0.3).means.sum().backward()
+    assert torch.equal(splats.means.grad, torch.ones_like(splats.means))
+
+
+def gradients_before_and_after(motion: Layer, progress: tuple[float, float]) -> list[set[str]]:
+    """Return the names of the tensors that get a gradient at each progress."""
+    reached = []
+    for now in progress:
+        motion.advance(now)
+        loss = weighted_sum(moved_by(motion, splats_of(COUNT), 0.3))
+        penalty = penalty_of(motion, splats_of(COUNT), 0.3, generator())
+        assert penalty is not None
+        (loss + penalty).backward()
+        tensors = motion.tensors()
+        reached.append({name for name, tensor in tensors.items() if tensor.grad is not None})
+        for tensor in tensors.values():
+            tensor.grad = None
+    return reached
+
+
+def test_multiscale_freezes_the_fine_field_before_coarse_until() -> None:
+    motion = disturbed(started("multiscale", coarse_until=0.25))
+    coarse, both = gradients_before_and_after(motion, (0.2, 0.25))
+    assert coarse and all(name.startswith("coarse") for name in coarse)
+    assert both == set(motion.tensors())
+
+
+def test_multiscale_moves_positions_only_while_coarse() -> None:
+    splats, motion = splats_of(COUNT), disturbed(started("multiscale", coarse_until=0.25))
+    motion.advance(0.1)
+    coarse = moved_by(motion, splats, 0.3)
+    assert not torch.equal(coarse.means, splats.means)
+    for name in ("quats", "log_scales", "logit_opacities", "sh"):
+        assert torch.equal(coarse.tensors()[name], splats.tensors()[name]), name
+    motion.advance(0.3)
+    fine = moved_by(motion, splats, 0.3)
+    for name in ("means", "quats", "log_scales"):
+        assert not torch.equal(fine.tensors()[name], coarse.tensors()[name]), name
+
+
+NO_PLANE_TERMS = {"space_smoothness": 0.0, "time_smoothness": 0.0, "time_stillness": 0.0}
+
+
+def test_multiscale_regularises_the_coarse_offset() -> None:
+    """L_reg is the mean squared offset in units of the bound."""
+    splats = splats_of(COUNT)
+    motion = disturbed(started("multiscale", offset_weight=2.0, coarse_until=1.0, **NO_PLANE_TERMS))
+    motion.advance(0.0)
+    offset = moved_by(motion, splats, 0.6).means - splats.means
+    penalty = penalty_of(motion, splats, 0.6, generator())
+    assert penalty is not None
+    expected = 2.0 * (offset / FACTS.bound).square().sum(dim=1).mean()
+    torch.testing.assert_close(penalty, expected, rtol=1e-4, atol=1e-9)
+
+
+@pytest.mark.parametrize("fine", [False, True])
+def test_multiscale_keeps_the_splats_own_features_small(fine: bool) -> None:
+    """By the mean square of all of them, once there is something that reads them."""
+    weights = {"offset_weight": 0.0, "embedding_weight": 3.0, **NO_PLANE_TERMS}
+    motion = disturbed(started("multiscale", **weights))
+    motion.advance(1.0 if fine else 0.0)
+    penalty = penalty_of(motion, splats_of(COUNT), 0.6, generator())
+    assert penalty is not None
+    expected = 3.0 * motion.tensors()["embeddings"].square().mean() if fine else torch.zeros(())
+    assert not fine or expected > 0
+    torch.testing.assert_close(penalty, expected)
+
+
+def test_multiscale_without_the_pyramid_gives_the_decoder_fewer_inputs() -> None:
+    inputs = [
+        started("multiscale", pyramid=pyramid).tensors()["decoder.0.weight"].shape[0]
+        for pyramid in (True, False)
+    ]
+    assert inputs[0] - inputs[1] == 16
+
+
+def test_multiscale_as_in_the_method_holds_nothing_per_splat() -> None:
+    motion = disturbed(started("multiscale", COUNT, embedding=0))
+    assert "embeddings" not in {*motion.tensors(), *(p.rate for p in motion.parameters())}
+    assert not any(parameter.per_splat for parameter in motion.parameters())
+    splats, rows = splats_of(COUNT), torch.tensor([0, 2])
+    expected = moved_by(motion, splats, 0.3).take(rows)
+    taken(motion, rows)
+    assert_equal(moved_by(motion, splats.take(rows), 0.3), expected, atol=1e-6, rtol=1e-6)
+
+
+def trained_within(value: object) -> list[Tensor]:
+    """Return all trained leaves that an object holds, also those in lists and tuples."""
+    if isinstance(value, Tensor):
+        return [value] if value.requires_grad else []
+    if isinstance(value, list | tuple):
+        return [tensor for item in value for tensor in trained_within(item)]
+    return []
+
+
+@pytest.mark.parametrize(
+    ("name", "options"),
+    [*((name, {}) for name in plugins.names(motions.__name__)), ("multiscale", {"embedding": 0})],
+)
+def test_all_that_is_trained_goes_where_the_model_goes(name: str, options: dict[str, int]) -> None:
+    """What a motion reads are the very tensors that its parameters name, and none is empty."""
+    motion = started(name, COUNT, **options)
+    held = trained_within(list(vars(motion).values()))
+    assert {*map(id, held)} == {*map(id, motion.tensors().values())}
+    assert all(tensor.numel() for tensor in held)
+    model_of(splats_of(COUNT), motion).to("cpu")
+    assert {*map(id, held)} == {*map(id, motion.tensors().values())}
+
+
+@pytest.mark.parametrize(
+    ("name", "option", "value", "allowed"),
+    [
+        *(("hexplane", *wrong) for wrong in WRONG),
+        *(("control_points", *wrong) for wrong in WRONG),
+        *(("multiscale", key, value, allowed.replace("8", "7")) for key, value, allowed in WRONG),
+        ("multiscale", "levels", [16] * 8, "1 to 7 whole numbers, each 2 or more"),
+        ("multiscale", "coarse_level", 1, "2 or more"),
+        ("multiscale", "coarse_channels", 24, "a multiple of 16, 16 or more"),
+        ("multiscale", "embedding", -16, "a multiple of 16, 0 or more"),
+        ("multiscale", "embedding", 8, "a multiple of 16, 0 or more"),
+    ],
+)
+def test_sizes_that_no_kernel_serves_are_refused(
+    name: str, option: str, value: object, allowed: str
+) -> None:
+    with pytest.raises(UsageError, match=f"motion: {option} is .*; allowed: {allowed}$"):
+        options_of(motions.__name__, {"name": name, option: value})
+
+
+@pytest.mark.parametrize(
+    ("name", "most"), [("hexplane", 8), ("control_points", 8), ("multiscale", 7)]
+)
+def test_as_many_levels_as_kernels_serve_are_taken(name: str, most: int) -> None:
+    motion = started(name, COUNT, levels=[2] * most)
+    moved = moved_by(motion, splats_of(COUNT), 0.4)
+    assert_equal(moved, splats_of(COUNT), atol=1e-6, rtol=1e-6)
+
+
+@pytest.mark.parametrize(("frames", "resolution"), [(2, 8), (100, 25), (150, 38)])
+def test_the_time_grid_follows_from_the_frames(frames: int, resolution: int) -> None:
+    motion = start_motion({"name": "hexplane"}, Facts(1.0, CUBE, frames), 1)
+    assert motion.tensors()["grid.0.time"].shape[2] == resolution
+
+
+def control_points_of(splats: int, **options: int) -> Layer:
+    return start_motion({"name": "control_points", **options}, FACTS, splats)
+
+
+def test_control_points_are_anchored_to_splats_that_show_and_all_goes_on_nearly_as_before() -> None:
+    splats = splats_of(3000)
+    splats.logit_opacities[:1000] = -9.0
+    splats.means[:1000] += 5.0
+    motion = disturbed(control_points_of(3000, count=600))
+    before = moved_by(motion, splats, 0.4)
+    with torch.no_grad():
+        assert set(motion.reanchor(splats)) == {"control_points", "log_radii"}
+    assert are_among(motion.tensors()["control_points"], splats.means[1000:])
+    after = moved_by(motion, splats, 0.4)
+    moved = (after.means - splats.means)[1000:].norm(dim=1).mean()
+    jumped = (after.means - before.means)[1000:].norm(dim=1).mean()
+    assert float(jumped.detach()) < 0.5 * float(moved.detach())
+
+
+def test_control_points_are_anchored_where_splats_are_if_too_few_of_them_show() -> None:
+    splats, motion = splats_of(20), control_points_of(20, count=30)
+    splats.logit_opacities.fill_(-9.0)
+    with torch.no_grad():
+        motion.reanchor(splats)
+    assert are_among(motion.tensors()["control_points"], splats.means)
+
+
+def test_control_points_are_anchored_to_finite_splats() -> None:
+    splats, motion = splats_of(50), control_points_of(50, count=30)
+    splats.means[::2, 1] = float("nan")
+    with torch.no_grad():
+        motion.reanchor(splats)
+        assert are_among(motion.tensors()["control_points"], splats.means[1::2])
+        splats.means[1::2, 0] = float("inf")
+        assert motion.reanchor(splats) == ()
+    assert are_among(motion.tensors()["control_points"], splats_of(50).means)
+
+
+@torch.no_grad()
+def test_control_points_follow_splats_that_have_changed_since() -> None:
+    """What is kept of one drawing for the next must not outlive the splats it was found for."""
+    splats, motion = splats_of(COUNT), disturbed(started("control_points"))
+    moved_by(motion, splats, 0.3)
+    others = splats_of(COUNT, seed=1)
+    expected = moved_by(disturbed(started("control_points")), others, 0.3)
+    assert_equal(moved_by(motion, others, 0.3), expected)
+    splats.means.copy_(others.means)
+    motion.advance(1.0)
+    assert torch.equal(moved_by(motion, splats, 0.3).means, expected.means)
+
+
+@pytest.mark.parametrize(
+    ("options", "found"),
+    [({"count": 3}, "count is 3; allowed: 4 or more"), ({"neighbours": 2000}, "1 to count")],
+)
+def test_control_points_refuse_numbers_out_of_range(options: dict[str, int], found: str) -> None:
+    with pytest.raises(UsageError, match=found):
+        control_points_of(1, **options)
+
+
+def test_control_points_are_to_move_as_parts_of_a_rigid_body() -> None:
+    """At any moment: of two penalties that differ in their random numbers alone, one is larger."""
+    motion = disturbed(started("control_points", rigidity=2.0, **NO_PLANE_TERMS))
+    first, second = (penalty_of(motion, splats_of(COUNT), 0.6, generator(seed)) for seed in (1, 2))
+    assert first is not None and second is not None and first > 0 and first != second
+    assert first == penalty_of(motion, splats_of(COUNT), 0.1, generator(1))
+    names = list(motion.tensors())
+    gradients = torch.autograd.grad(first, list(motion.tensors().values()), allow_unused=True)
+    learnt = {name for name, part in zip(names, gradients, strict=True) if part is not None}
+    assert {name for name in names if name.startswith(("grid", "network"))} <= learnt
+    assert "control_points" not in learnt
+    loose = disturbed(started("control_points", rigidity=0.0, **NO_PLANE_TERMS))
+    assert not penalty_of(loose, splats_of(COUNT), 0.6, generator())
