@@ -12,7 +12,7 @@ from torch import Tensor
 
 from gsdmsr_cli.gaussians.splats import Splats
 from gsdmsr_cli.ops.displace import OUTPUTS
-from gsdmsr_cli.ops.nearest import nearest_nodes
+from gsdmsr_cli.ops.nearest import nearest_points
 from gsdmsr_cli.ops.skin import transforms
 
 Move = Callable[[Splats, Tensor, Tensor, Tensor, Tensor], Splats]
@@ -22,7 +22,7 @@ LOST = [0, 13, 32]
 """Which of 33 splats are not finite: the first, the last, and one among others."""
 
 
-def nodes_of(count: int, seed: int = 3) -> list[Tensor]:
+def control_points_of(count: int, seed: int = 3) -> list[Tensor]:
     """Return places, log radii and deformations of control points."""
     rng = generator(seed)
     places = torch.randn(count, 3, generator=rng)
@@ -43,14 +43,14 @@ def learnt_from_33(move: Move, dtype: torch.dtype, finite: bool) -> list[Tensor]
         finite: whether the splats ``LOST`` are finite all the same.
     """
     splats = splats_of(33).map(lambda t: t.to(dtype))
-    near = nearest_nodes(splats.means, nodes_of(20)[0].to(dtype), guesses(33, 4))
+    near = nearest_points(splats.means, control_points_of(20)[0].to(dtype), guesses(33, 4))
     slopes = torch.randn(33, 10, generator=generator(5)).to(dtype)
     slopes[LOST] = 0
     if not finite:
         for row, value in zip(LOST, (math.nan, math.inf, -math.inf), strict=True):
             splats.means[row, 1], splats.quats[row, 2] = value, math.nan
-    own = leaves(nodes_of(20), dtype)
-    near = nearest_nodes(splats.means, own[0].detach(), near)
+    own = leaves(control_points_of(20), dtype)
+    near = nearest_points(splats.means, own[0].detach(), near)
     assert near.min() >= 0 and near.max() < 20
     splats = splats.map(lambda t: t.requires_grad_())
     moved = move(splats, own[0], own[1], transforms(own[0], own[2]), near)

@@ -19,7 +19,7 @@ from gsdmsr_cli.ops import displace as deformation
 from gsdmsr_cli.ops import network, planes, precision
 from gsdmsr_cli.ops import skin as skinning
 from gsdmsr_cli.ops.adam.cuda import Row, adam
-from gsdmsr_cli.ops.nearest import nearest_nodes
+from gsdmsr_cli.ops.nearest import nearest_points
 
 Values = dict[str, Tensor]
 
@@ -111,7 +111,7 @@ def _find_nearest(device: str, dtype: torch.dtype) -> Values:
         t.to(device, dtype) for t in (_random(_COUNT, 3), _random(_POINTS, 3, seed=1))
     )
     guesses = torch.zeros(_COUNT, _NEAR, dtype=torch.int32, device=device)
-    return {"rows": nearest_nodes(points, control_points, guesses).double()}
+    return {"rows": nearest_points(points, control_points, guesses).double()}
 
 
 def _transform(device: str, dtype: torch.dtype) -> Values:

@@ -11,7 +11,7 @@ import pytest
 import torch
 from kernel_checks import assert_near, generator, leaves
 from motion_checks import splats_of
-from skinning_checks import guesses, nodes_of
+from skinning_checks import control_points_of, guesses
 from torch import Tensor
 
 from gsdmsr_cli.backends.cuda import compiler, launch
@@ -20,7 +20,7 @@ from gsdmsr_cli.gaussians.moment import Moment
 from gsdmsr_cli.gaussians.splats import Splats
 from gsdmsr_cli.ops import planes
 from gsdmsr_cli.ops import skin as skinning
-from gsdmsr_cli.ops.nearest import nearest_nodes
+from gsdmsr_cli.ops.nearest import nearest_points
 from gsdmsr_cli.ops.planes import cuda as grids
 from gsdmsr_cli.raster import cuda
 
@@ -93,10 +93,10 @@ def looking_up(dtype: torch.dtype) -> list[Tensor]:
 
 def following() -> list[Tensor]:
     """Splats that follow control points, of which some are given no gradient."""
-    splats, (nodes, log_radii, deformation) = splats_of(150), nodes_of(45)
+    splats, (points, log_radii, deformation) = splats_of(150), control_points_of(45)
     stored = [splats.means, splats.quats, splats.log_scales]
-    own = leaves([*stored, nodes, log_radii, deformation], torch.float32)
-    near = nearest_nodes(stored[0], nodes, guesses(150, 8))
+    own = leaves([*stored, points, log_radii, deformation], torch.float32)
+    near = nearest_points(stored[0], points, guesses(150, 8))
     moving = replace(splats, means=own[0], quats=own[1], log_scales=own[2])
     made = skinning.transforms(own[3], own[5])
     moved = skinning.skin(moving, own[3], own[4], made, near)
@@ -111,7 +111,7 @@ WORKS: dict[str, Callable[[], list[Tensor]]] = {
     "L1": lambda: comparing(0.0),
     "L1, weighted tiles": lambda: comparing(0.0, weighted=True),
     "L1 and SSIM": lambda: comparing(0.2),
-    "nodes": following,
+    "control_points": following,
     "plane grids": lambda: looking_up(torch.float32),
     "plane grids in bf16": lambda: looking_up(torch.bfloat16),
     "plane grids in fp16": lambda: looking_up(torch.float16),

@@ -25,7 +25,7 @@ from gsdmsr_cli.model.motion._rigidity import rigidity
 from gsdmsr_cli.model.parameter import Parameter
 from gsdmsr_cli.ops import network, planes, skin, spread
 from gsdmsr_cli.ops.displace import OUTPUTS
-from gsdmsr_cli.ops.nearest import nearest_nodes
+from gsdmsr_cli.ops.nearest import Nearest
 from gsdmsr_cli.options import strict
 
 _POINTS, _LOG_RADII = "control_points", "log_radii"
@@ -78,7 +78,7 @@ class ControlPointMotion(Layer):
         self.options, self.facts = options, facts
         lower, upper = torch.tensor(facts.box)
         anywhere = torch.rand(options.count, 3, generator=generator)
-        self.control_points = spread.spread_nodes(lower + (upper - lower) * anywhere, options.count)
+        self.control_points = spread.spread_out(lower + (upper - lower) * anywhere, options.count)
         self.log_radii = self._initial_log_radii(self.control_points)
         times = time_nodes(facts.frames, options.time_ratio)
         self.levels = [
@@ -87,9 +87,9 @@ class ControlPointMotion(Layer):
         ]
         widths = [options.channels * len(options.levels), options.width, options.width, OUTPUTS]
         self.layers = network.new_network(widths, generator)
-        self._near: Tensor | None = None
+        self._search, self._pairs = Nearest(options.neighbours), Nearest(options.neighbours)
+        self._near = torch.zeros(0, options.neighbours, dtype=torch.int32)
         self._found_for: Tensor | None = None
-        self._pairs = torch.zeros(options.count, options.neighbours, dtype=torch.int32)
         super().__init__(
             [
                 Parameter(_POINTS, self.control_points, rate="network"),
@@ -120,15 +120,18 @@ class ControlPointMotion(Layer):
         The search is repeated whenever splats or control points may have changed: always in
         training, and once for all the moments at which a finished model is drawn.
         """
-        if self._near is None or len(self._near) != len(means):
-            self._near = torch.zeros(len(means), self.options.neighbours, dtype=torch.int32)
-            self._found_for = None
-        unchanged = self._found_for is not None and self._found_for.data_ptr() == means.data_ptr()
-        if torch.is_grad_enabled() or not unchanged:
-            self._near = nearest_nodes(means, self.control_points, self._near.to(means.device))
+        if torch.is_grad_enabled() or not self._knows(means):
+            self._near = self._search.find(means, self.control_points)
             # kept, so that no other splats get this memory
             self._found_for = None if torch.is_grad_enabled() else means.detach()
         return self._near
+
+    def _knows(self, means: Tensor) -> bool:
+        """Return whether the neighbours that were found last are those of these splats."""
+        known = self._found_for
+        return (
+            known is not None and known.data_ptr() == means.data_ptr() and len(known) == len(means)
+        )
 
     def reanchor(self, splats: Splats) -> Sequence[str]:
         """Spread the control points evenly over the present splats that are not transparent.
@@ -141,7 +144,7 @@ class ControlPointMotion(Layer):
         places = splats.means[opaque if enough else finite]
         if not len(places):
             return ()
-        points = spread.spread_nodes(places, len(self.control_points))
+        points = spread.spread_out(places, len(self.control_points))
         self.control_points.copy_(points)
         self.log_radii.copy_(self._initial_log_radii(points))
         self._found_for = None
@@ -149,7 +152,7 @@ class ControlPointMotion(Layer):
 
     def take(self, rows: Tensor, fresh: Tensor) -> None:
         """Drop the neighbours that were found; no parameter has a row per splat."""
-        self._near = self._found_for = None
+        self._found_for = None
 
     def advance(self, progress: float) -> None:
         """Drop the neighbours that were found; there are no phases."""
@@ -165,10 +168,10 @@ class ControlPointMotion(Layer):
         if not o.rigidity:
             return value
         points = self.control_points.detach()
-        self._pairs = nearest_nodes(points, points, self._pairs.to(points.device))
+        near = self._pairs.find(points, points)
         time = float(torch.rand((), generator=generator))
         transforms = self._transforms(points, time)
-        return value + o.rigidity * rigidity(points, transforms, self._pairs)
+        return value + o.rigidity * rigidity(points, transforms, near)
 
     def check(self) -> None:
         """Raise ValueError unless control points, grid and network fit together."""
@@ -179,8 +182,7 @@ class ControlPointMotion(Layer):
             raise ValueError(f"{radii} control points for {self.options.neighbours} neighbours")
         planes.check_levels(self.levels)
         network.check_network(self.layers, planes.features_of(self.levels), OUTPUTS)
-        self._near = self._found_for = None
-        self._pairs = self._pairs.new_zeros(radii, self.options.neighbours)
+        self._found_for = None
 
 
 def start(

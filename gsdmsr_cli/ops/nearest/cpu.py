@@ -1,6 +1,13 @@
-"""Finds the nearest of few points for each of many: by a guess, then in boxes of 16."""
+"""Finds the nearest of few points for each of many queries, again and again while both move.
+
+Where neither can have moved far enough to change it, the earlier result stands. Elsewhere it is a
+guess, which the points within its distance confirm. Else the nearest are searched for, in boxes of
+16 points.
+"""
 
 from __future__ import annotations
+
+import math
 
 import numpy as np
 from numba import float32, prange
@@ -12,22 +19,26 @@ _LANES = simd.LANES
 _BLOCKS = 16
 _BATCH = 64
 """Boxes that are looked at together: bits of an integer tell which of them are near enough."""
-_ZERO = float32(0)
+_ZERO, _HALF, _ONE = float32(0), float32(0.5), float32(1)
 _FAR = float32(1e18)
 _INFINITE = float32(np.inf)
 _SLACK = float32(1.0001)
 """A distance that is worked out anew may round otherwise than a bound on it."""
+_BEYOND = float32(1.2)
+"""The nearest of the other points is looked for within so many times the squared bound."""
+_ROUNDED = 1 - 1e-6
+"""Sums of lengths count as so much shorter: rounding may have made them longer."""
 
 
 @inline
-def _group(nodes, flat, corners, boxes):
-    """Lay nodes out by axis and write the boxes of every 16 in a row, also by axis."""
-    for g in range((nodes.shape[0] + _LANES - 1) // _LANES):
+def _group(points, flat, corners, boxes):
+    """Lay points out by axis and write the boxes of every 16 in a row, also by axis."""
+    for g in range((points.shape[0] + _LANES - 1) // _LANES):
         for axis in range(3):
             low, high = _FAR, -_FAR
-            for j in range(g * _LANES, min(nodes.shape[0], (g + 1) * _LANES)):
-                flat[axis * boxes * _LANES + j] = nodes[j, axis]
-                low, high = min(low, nodes[j, axis]), max(high, nodes[j, axis])
+            for j in range(g * _LANES, min(points.shape[0], (g + 1) * _LANES)):
+                flat[axis * boxes * _LANES + j] = points[j, axis]
+                low, high = min(low, points[j, axis]), max(high, points[j, axis])
             corners[axis * boxes + g] = low
             corners[(3 + axis) * boxes + g] = high
 
@@ -52,15 +63,19 @@ def _boxes_within(x, y, z, corners, boxes, at, bound):
 
 
 @inline
-def _square(points, i, nodes, j):
-    """Return the squared distance of a point to a node."""
-    x, y, z = points[i, 0] - nodes[j, 0], points[i, 1] - nodes[j, 1], points[i, 2] - nodes[j, 2]
+def _square(queries, i, points, j):
+    """Return the squared distance of a query to a point."""
+    x, y, z = (
+        queries[i, 0] - points[j, 0],
+        queries[i, 1] - points[j, 1],
+        queries[i, 2] - points[j, 2],
+    )
     return x * x + y * y + z * z
 
 
 @inline
-def _bound(points, i, nodes, near):
-    """Return a squared distance that the guessed nodes lie within, infinite if they are no guess.
+def _bound(queries, i, points, near):
+    """Return a squared distance that the guessed points lie within, infinite if they are no guess.
 
     Guesses are rows in ascending order.
     """
@@ -69,13 +84,13 @@ def _bound(points, i, nodes, near):
         j = near[i, k]
         if k > 0 and j <= near[i, k - 1]:
             return _INFINITE
-        bound = max(bound, _square(points, i, nodes, j))
+        bound = max(bound, _square(queries, i, points, j))
     return bound * _SLACK + float32(1e-30)
 
 
 @inline
 def _distances(x, y, z, flat, boxes, g):
-    """Return the squared distances to the 16 nodes of a box."""
+    """Return the squared distances to the 16 points of a box."""
     a = simd.load(flat, g * _LANES) - x
     b = simd.load(flat, (boxes + g) * _LANES) - y
     c = simd.load(flat, (2 * boxes + g) * _LANES) - z
@@ -83,21 +98,30 @@ def _distances(x, y, z, flat, boxes, g):
 
 
 @inline
-def _nodes_within(x, y, z, flat, corners, boxes, bound):
-    """Return how many nodes lie within a squared distance."""
-    count, limit = 0, simd.splat(bound)
+def _room(x, y, z, flat, corners, boxes, bound, kept):
+    """Return how far a query and all points may go, added up, before another point can be nearer.
+
+    That is half of how much farther the nearest of the others is than those within a squared
+    distance; -1 if the points within it are not as many as are kept.
+    """
+    count, limit, reach = 0, simd.splat(bound), simd.splat(_BEYOND * bound)
+    others, far = reach, simd.splat(_FAR)
     for first in range(0, boxes, _BATCH):
-        rest = _boxes_within(x, y, z, corners, boxes, first, limit)
+        rest = _boxes_within(x, y, z, corners, boxes, first, reach)
         while rest != 0:
-            g = first + simd.lowest_bit(rest)
-            count += simd.count_bits(simd.lanes_le(_distances(x, y, z, flat, boxes, g), limit))
+            found = _distances(x, y, z, flat, boxes, first + simd.lowest_bit(rest))
+            count += simd.count_bits(simd.lanes_le(found, limit))
+            others = simd.minimum(others, found + simd.where_ge(limit, found, far))
             rest &= rest - 1
-    return count
+    if count != kept:
+        return -_ONE
+    nearest_other = -simd.reduce_max(simd.splat(_ZERO) - others)
+    return _HALF * (math.sqrt(nearest_other) - math.sqrt(bound))
 
 
 @inline
 def _insert(near, i, best, row, distance):
-    """Put a node where it belongs among the nearest so far, if it does; ``best`` ascends."""
+    """Put a point where it belongs among the nearest so far, if it does; ``best`` ascends."""
     k = near.shape[1]
     while k > 0 and best[k - 1] > distance:
         if k < near.shape[1]:
@@ -109,7 +133,7 @@ def _insert(near, i, best, row, distance):
 
 @inline
 def _search(x, y, z, flat, corners, boxes, count, bound, near, i, best, distances):
-    """Write the nearest of ``count`` nodes, all of which lie within a squared distance."""
+    """Write the nearest of ``count`` points, all of which lie within a squared distance."""
     best[:], limit = bound, simd.splat(bound)
     for first in range(0, boxes, _BATCH):
         rest = _boxes_within(x, y, z, corners, boxes, first, limit)
@@ -138,29 +162,61 @@ def _sort(rows, i):
         rows[i, at] = value
 
 
-@parallel
-def nearest(points, nodes, near):
-    """Find the nearest nodes of each point, exactly.
+@inline
+def _drift(points, before):
+    """Return how far any point has gone from where it was, and put down where it is."""
+    farthest, total = _ZERO, _ZERO
+    for j in range(points.shape[0]):
+        square = _square(points, j, before, j)
+        farthest, total = max(farthest, square), total + square
+        for axis in range(3):
+            before[j, axis] = points[j, axis]
+    return _SLACK * math.sqrt(farthest) if total < _INFINITE else _INFINITE
 
-    Guesses mostly prove right: then no other node lies within their distance. Where others do, the
-    nearest are searched for. Only nodes in boxes that are near enough are looked at.
+
+@inline
+def _stands(queries, i, places, until, gone):
+    """Return whether a query and the points are too near to where they were for another result."""
+    room = float32(until[i] - gone)
+    return room > _ZERO and _square(queries, i, places, i) < room * room
+
+
+@parallel
+def nearest(queries, points, near, places, until, before, drift):
+    """Find the nearest points of each query, exactly.
+
+    What an earlier call has found may be given to the next, whatever has changed meanwhile.
 
     Args:
-        points: (N, 3).
-        nodes: (M, 3); it is quick where those that follow each other lie near each other.
+        queries: (N, 3).
+        points: (M, 3); it is quick where those that follow each other lie near each other.
         near: (N, K) int32, K at most M; in: guesses, an earlier result or zeros; out: the rows of
             the nearest, in ascending order; of equally near ones the first.
+        places: (N, 3), where queries were when ``near`` was confirmed; in and out.
+        until: (N,), by how much ``drift`` and the way of a query from its place may add up before
+            the result can change, zeros at first; in and out.
+        before: (M, 3), where the points were in the call before; in and out.
+        drift: (1,) float64, how far any point may have gone in all calls, 0 at first; in and out.
     """
-    (n, kept), count = near.shape, nodes.shape[0]
+    (n, kept), count = near.shape, points.shape[0]
     boxes = (count + _BATCH * _LANES - 1) // (_BATCH * _LANES) * _BATCH
     flat, corners = np.full(3 * boxes * _LANES, _FAR), np.full(6 * boxes, _FAR)
-    _group(nodes, flat, corners, boxes)
+    _group(points, flat, corners, boxes)
+    gone = drift[0] + _drift(points, before)
+    drift[0] = gone
     for block in prange(_BLOCKS):
         best, distances = np.empty(kept, np.float32), np.empty(_LANES, np.float32)
         for i in range(n * block // _BLOCKS, n * (block + 1) // _BLOCKS):
-            x, y, z = simd.splat(points[i, 0]), simd.splat(points[i, 1]), simd.splat(points[i, 2])
-            bound = _bound(points, i, nodes, near)
-            if bound < _INFINITE and _nodes_within(x, y, z, flat, corners, boxes, bound) == kept:
+            if _stands(queries, i, places, until, gone):
                 continue
-            _search(x, y, z, flat, corners, boxes, count, bound, near, i, best, distances)
-            _sort(near, i)
+            x, y = simd.splat(queries[i, 0]), simd.splat(queries[i, 1])
+            z = simd.splat(queries[i, 2])
+            bound, room = _bound(queries, i, points, near), -_ONE
+            if bound < _INFINITE:
+                room = _room(x, y, z, flat, corners, boxes, bound, kept)
+            if room < _ZERO:
+                _search(x, y, z, flat, corners, boxes, count, bound, near, i, best, distances)
+                _sort(near, i)
+            until[i] = (gone + room) * _ROUNDED
+            for axis in range(3):
+                places[i, axis] = queries[i, axis]

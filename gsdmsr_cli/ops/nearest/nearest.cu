@@ -1,41 +1,41 @@
-// Finds the nearest of few points, the control points, for each of many.
+// Finds the nearest of few queries, the control queries, for each of many.
 #include "common.cuh"
 #include "distance.cuh"
 
 #define THREADS 128
-#define KEPT 8  // control points that one pass over all of them finds
+#define KEPT 8  // control queries that one pass over all of them finds
 #define SLACK 1.0001f  // a distance that is worked out anew may round otherwise than a bound on it
 
-// A squared distance that the guessed nodes lie within, or LARGEST if they are no guess. Guesses are rows in
+// A squared distance that the guessed points lie within, or LARGEST if they are no guess. Guesses are rows in
 // ascending order.
 __device__ __forceinline__ float bound_of(
-    float x, float y, float z, const float *nodes, int kept, const int *near
+    float x, float y, float z, const float *points, int kept, const int *near
 ) {
     float bound = 0.0f;
     for (int k = 0; k < kept; k++) {
         if (k > 0 && near[k] <= near[k - 1]) return LARGEST;
-        float square = square_to(x, y, z, nodes + 3 * (size_t)near[k]);
+        float square = square_to(x, y, z, points + 3 * (size_t)near[k]);
         if (!(square <= LARGEST)) return LARGEST;
         bound = fmaxf(bound, square);
     }
     return fminf(bound * SLACK + 1e-30f, LARGEST);
 }
 
-// Finds the nearest nodes of each of n points, exactly: near (n, kept) holds guesses, and gets the rows of the
-// nearest in ascending order; of equally near ones the first. Of a point that is not finite it gets any rows.
+// Finds the nearest points of each of n queries, exactly: near (n, kept) holds guesses, and gets the rows of the
+// nearest in ascending order; of equally near ones the first. Of a query that is not finite it gets any rows.
 //
-// A block reads the nodes into shared memory once for all of its points. Each thread keeps the 8 nearest in
+// A block reads the points into shared memory once for all of its queries. Each thread keeps the 8 nearest in
 // registers; where more are wanted, further passes find the 8 that come next, by distance and then by row.
 extern "C" __global__ void __launch_bounds__(THREADS) nearest(
-    int n, int count, int kept, const float *points, const float *nodes, int *near
+    int n, int count, int kept, const float *queries, const float *points, int *near
 ) {
     __shared__ float tile[3 * THREADS];
     int i = blockIdx.x * THREADS + threadIdx.x;
     bool there = i < n;
-    const float *point = points + 3 * (size_t)(there ? i : 0);
-    float x = point[0], y = point[1], z = point[2], bound = LARGEST;
+    const float *query = queries + 3 * (size_t)(there ? i : 0);
+    float x = query[0], y = query[1], z = query[2], bound = LARGEST;
     int *own = near + (size_t)(there ? i : 0) * kept;
-    if (there) bound = bound_of(x, y, z, nodes, kept, own);
+    if (there) bound = bound_of(x, y, z, points, kept, own);
     float last = -1.0f;  // the farthest of the passes before, and its row
     int last_row = -1;
     for (int found = 0; found < kept; found += KEPT) {
@@ -49,7 +49,7 @@ extern "C" __global__ void __launch_bounds__(THREADS) nearest(
         for (int start = 0; start < count; start += THREADS) {
             int held = min(THREADS, count - start);
             __syncthreads();
-            for (int k = threadIdx.x; k < 3 * held; k += THREADS) tile[k] = nodes[3 * (size_t)start + k];
+            for (int k = threadIdx.x; k < 3 * held; k += THREADS) tile[k] = points[3 * (size_t)start + k];
             __syncthreads();
             for (int j = 0; j < held; j++) {
                 float square = square_to(x, y, z, tile + 3 * j);

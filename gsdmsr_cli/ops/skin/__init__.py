@@ -1,7 +1,7 @@
-"""Splats that follow the nodes near them: SC-GS's sparse control points (Huang et al., CVPR 2024).
+"""Splats that follow the control points near them (SC-GS, Huang et al., CVPR 2024).
 
-Linear blend skinning, section 3.2 there: a node at p with rotation R and offset T takes a place x
-to R (x - p) + p + T, and a splat goes to the weighted mean of what its nearest nodes make of it.
+Linear blend skinning, section 3.2 there: a point at p with rotation R and offset T takes a place x
+to R (x - p) + p + T, and a splat goes to the weighted mean of what its nearest points make of it.
 """
 
 from __future__ import annotations
@@ -23,37 +23,37 @@ from gsdmsr_cli.ops.skin import cuda
 from gsdmsr_cli.ops.skin.twin import COLUMNS, skin_twin, transforms_twin
 
 
-def transforms(nodes: Tensor, deformation: Tensor) -> Tensor:
-    """Return what nodes (M, 3) do to the splats that follow them, (M, 19), see ``COLUMNS``.
+def transforms(points: Tensor, deformation: Tensor) -> Tensor:
+    """Return what control points (M, 3) do to splats that follow them, (M, 19), see ``COLUMNS``.
 
     Args:
-        nodes: their canonical places.
+        points: their canonical places.
         deformation: (M, 10) offset of the place, of the quaternion (1, 0, 0, 0), which is then of
             unit length, and of the log scales.
     """
-    form = choose(nodes, deformation)
+    form = choose(points, deformation)
     if form == "cuda":
-        return cuda.transforms(nodes, deformation, kernels.SHORTEST)
+        return cuda.transforms(points, deformation, kernels.SHORTEST)
     if form == "cpu":
-        made: Tensor = _Transform.apply(nodes, deformation)
+        made: Tensor = _Transform.apply(points, deformation)
         return made
-    return transforms_twin(nodes, deformation)
+    return transforms_twin(points, deformation)
 
 
 def skin(
-    splats: Splats, nodes: Tensor, log_radii: Tensor, transforms: Tensor, near: Tensor
+    splats: Splats, points: Tensor, log_radii: Tensor, transforms: Tensor, near: Tensor
 ) -> Splats:
-    """Return N splats where their nodes take them.
+    """Return N splats where the control points near them take them.
 
     Args:
         splats: N canonical splats.
-        nodes: (M, 3) canonical places of the nodes.
+        points: (M, 3) canonical places of the control points.
         log_radii: (M,) logarithms of how far they reach [world units].
         transforms: (M, 19), see ``transforms``.
-        near: (N, K) int32, the nodes of each splat.
+        near: (N, K) int32, the control points that each splat follows.
     """
     stored = splats.means, splats.quats, splats.log_scales
-    by = nodes, log_radii, transforms, near
+    by = points, log_radii, transforms, near
     form = choose(*stored, *by[:3])
     if form == "cuda":
         means, quats, log_scales = cuda.skin(stored, *by)
@@ -69,20 +69,20 @@ __all__ = ["COLUMNS", "skin", "skin_twin", "transforms", "transforms_twin"]
 
 class _Transform(Function):
     @staticmethod
-    def forward(ctx: Any, nodes: Tensor, deformation: Tensor) -> Tensor:
-        nodes, deformation = nodes.contiguous(), deformation.contiguous()
-        made = nodes.new_empty(len(nodes), sum(COLUMNS))
-        kernels.transform(*_arrays(nodes, deformation, made))
-        ctx.save_for_backward(nodes, deformation, made)
+    def forward(ctx: Any, points: Tensor, deformation: Tensor) -> Tensor:
+        points, deformation = points.contiguous(), deformation.contiguous()
+        made = points.new_empty(len(points), sum(COLUMNS))
+        kernels.transform(*_arrays(points, deformation, made))
+        ctx.save_for_backward(points, deformation, made)
         return made
 
     @staticmethod
     @once_differentiable  # type: ignore[untyped-decorator]
     def backward(ctx: Any, given: Tensor) -> tuple[Tensor, Tensor]:
-        nodes, deformation, made = ctx.saved_tensors
-        gradients = torch.empty_like(nodes), torch.empty_like(deformation)
+        points, deformation, made = ctx.saved_tensors
+        gradients = torch.empty_like(points), torch.empty_like(deformation)
         kernels.transform_backward(
-            *_arrays(nodes, deformation, made, given.contiguous(), *gradients)
+            *_arrays(points, deformation, made, given.contiguous(), *gradients)
         )
         return gradients
 
@@ -94,14 +94,14 @@ class _Skin(Function):
         means: Tensor,
         quats: Tensor,
         log_scales: Tensor,
-        nodes: Tensor,
+        points: Tensor,
         log_radii: Tensor,
         transforms: Tensor,
         near: Tensor,
     ) -> tuple[Tensor, Tensor, Tensor]:
         means, quats, log_scales = (t.contiguous() for t in (means, quats, log_scales))
         sharpness = torch.exp(-2 * log_radii)
-        by = [t.contiguous() for t in (nodes, sharpness, transforms, near)]
+        by = [t.contiguous() for t in (points, sharpness, transforms, near)]
         weights = torch.empty(near.shape)
         moved = torch.empty_like(means), torch.empty_like(quats), torch.empty_like(log_scales)
         kernels.skin(*_arrays(means, quats, log_scales, *by, weights, *moved))

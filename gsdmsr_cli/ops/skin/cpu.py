@@ -2,8 +2,8 @@
 
 A transform has 19 columns, each the difference from what leaves a splat alone: a 3x3 matrix by rows
 and an offset, which move a place x by (matrix x + offset); a quaternion, which turns q by
-(quaternion q); and an offset of the log scales. A splat's transform is the mean of its nodes', with
-weights softmax(-d^2 / (2 r^2)) of its distances d to them and their radii r.
+(quaternion q); and an offset of the log scales. A splat's transform is the mean of those of its
+control points, with weights softmax(-d^2 / (2 r^2)) of its distances d to them and their radii r.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _LANES = simd.LANES
 _PLACE, _STEEPNESS, _AGAIN, _GROWTH, _SHARPNESS, _WIDTH = 16, 19, 20, 23, 26, 2 * _LANES
 """What rows of two vectors, in two cache lines, hold behind the first 16 columns of a transform.
 
-That are its node's place, what squared distances are multiplied by for the powers of 2 that it
+That are its point's place, what squared distances are multiplied by for the powers of 2 that it
 weighs, the place again, the transform's other columns, and the sharpness. Rows of sums hold the
 same columns: gradients, and where the place stands again, that of the log radius by axis.
 """
@@ -44,7 +44,7 @@ _INFINITE = float32(np.inf)
 
 @inline
 def _turn(deformation, j):
-    """Return the quaternion of a node's deformation in unit length, and the length it had."""
+    """Return the quaternion of a point's deformation in unit length, and the length it had."""
     w, x = _ONE + deformation[j, 3], deformation[j, 4]
     y, z = deformation[j, 5], deformation[j, 6]
     norm = max(math.sqrt(w * w + x * x + y * y + z * z), _SHORTEST)
@@ -52,22 +52,22 @@ def _turn(deformation, j):
 
 
 @serial
-def transform(nodes, deformation, transforms):
-    """Write what nodes do to the splats that follow them.
+def transform(points, deformation, transforms):
+    """Write what control points do to the splats that follow them.
 
     Args:
-        nodes: (M, 3) canonical places.
+        points: (M, 3) canonical places.
         deformation: (M, 10) offsets of place, of the quaternion (1, 0, 0, 0), of log scales.
         transforms: (M, 19) out.
     """
-    for j in range(nodes.shape[0]):
+    for j in range(points.shape[0]):
         w, x, y, z, _ = _turn(deformation, j)
         for s, entry in enumerate(rotation(w, x, y, z)):
             transforms[j, s] = entry - _ONE if s % 4 == 0 else entry
         for r in range(3):
             shift = deformation[j, r]
             for s in range(3):
-                shift -= transforms[j, 3 * r + s] * nodes[j, s]
+                shift -= transforms[j, 3 * r + s] * points[j, s]
             transforms[j, OFFSET + r] = shift
             transforms[j, GROWTH + r] = deformation[j, 7 + r]
         transforms[j, QUAT], transforms[j, QUAT + 1] = w - _ONE, x
@@ -75,23 +75,23 @@ def transform(nodes, deformation, transforms):
 
 
 @serial
-def transform_backward(nodes, deformation, transforms, d_transforms, d_nodes, d_deformation):
+def transform_backward(points, deformation, transforms, d_transforms, d_points, d_deformation):
     """Write the gradients of ``transform``.
 
     Args:
         transforms: (M, 19) what it wrote.
         d_transforms: (M, 19).
-        d_nodes, d_deformation: (M, 3), (M, 10) out.
+        d_points, d_deformation: (M, 3), (M, 10) out.
     """
     m = np.empty(9, np.float32)
-    for j in range(nodes.shape[0]):
+    for j in range(points.shape[0]):
         for s in range(3):
-            d_nodes[j, s] = _ZERO
+            d_points[j, s] = _ZERO
         for r in range(3):
             given = d_transforms[j, OFFSET + r]
             for s in range(3):
-                m[3 * r + s] = d_transforms[j, 3 * r + s] - given * nodes[j, s]
-                d_nodes[j, s] -= given * transforms[j, 3 * r + s]
+                m[3 * r + s] = d_transforms[j, 3 * r + s] - given * points[j, s]
+                d_points[j, s] -= given * transforms[j, 3 * r + s]
             d_deformation[j, r] = given
             d_deformation[j, 7 + r] = d_transforms[j, GROWTH + r]
         w, x, y, z, norm = _turn(deformation, j)
@@ -108,17 +108,17 @@ def transform_backward(nodes, deformation, transforms, d_transforms, d_nodes, d_
 
 
 @inline
-def _lay_out(nodes, sharpness, transforms):
-    """Return the rows of all nodes; what they leave free is 0."""
-    rows = simd.empty_aligned(nodes.shape[0] * _WIDTH)
+def _lay_out(points, sharpness, transforms):
+    """Return the rows of all control points; what they leave free is 0."""
+    rows = simd.empty_aligned(points.shape[0] * _WIDTH)
     rows[:] = _ZERO
-    for j in range(nodes.shape[0]):
+    for j in range(points.shape[0]):
         at = j * _WIDTH
         for s in range(GROWTH):
             rows[at + s] = transforms[j, s]
         for s in range(3):
             rows[at + _GROWTH + s] = transforms[j, GROWTH + s]
-            rows[at + _PLACE + s] = rows[at + _AGAIN + s] = nodes[j, s]
+            rows[at + _PLACE + s] = rows[at + _AGAIN + s] = points[j, s]
         rows[at + _STEEPNESS] = -_HALF * _LOG2_E * sharpness[j]
         rows[at + _SHARPNESS] = sharpness[j]
     return rows
@@ -132,9 +132,9 @@ def _columns(first, count):
 
 @inline
 def _powers(means, i, rows, near, powers, at):
-    """Write the powers of 2 that a splat's nodes weigh in proportion to; return the highest.
+    """Write the powers of 2 that a splat's points weigh in proportion to; return the highest.
 
-    By a vector for each node: gathering nodes' values by lanes would be slower.
+    By a vector for each point: gathering points' values by lanes would be slower.
     """
     highest, where = -_INFINITE, _columns(_PLACE, 3)
     x, y, z = (_columns(_PLACE, 1), _columns(_PLACE + 1, 1), _columns(_PLACE + 2, 1))
@@ -150,7 +150,7 @@ def _powers(means, i, rows, near, powers, at):
 
 @inline
 def _weigh(powers, at, kept, highest):
-    """Turn the powers of a splat's nodes into their weights."""
+    """Turn the powers of a splat's control points into their weights."""
     total, least = simd.splat(_ZERO), simd.splat(_LEAST_POWER)
     for o in range(0, kept, _LANES):
         power = simd.maximum(least, simd.load(powers, at + o) - highest)
@@ -165,7 +165,7 @@ def _weigh(powers, at, kept, highest):
 
 @inline
 def _blend(rows, near, i, own, at, weights, blend):
-    """Write the weights of a splat's nodes, and the mean of their rows."""
+    """Write the weights of a splat's control points, and the mean of their rows."""
     low, high = simd.splat(_ZERO), simd.splat(_ZERO)
     for k in range(near.shape[1]):
         j, weight = near[i, k] * _WIDTH, own[at + k]
@@ -195,22 +195,22 @@ def _move(t, means, quats, log_scales, i, moved, turned, scaled):
 
 @parallel
 def skin(
-    means, quats, log_scales, nodes, sharpness, transforms, near, weights, moved, turned, scaled
+    means, quats, log_scales, points, sharpness, transforms, near, weights, moved, turned, scaled
 ):
-    """Move N splats by M nodes.
+    """Move N splats by M control points.
 
     Args:
         means, quats, log_scales: (N, 3), (N, 4), (N, 3).
-        nodes: (M, 3).
+        points: (M, 3).
         sharpness: (M,) inverse squared radii.
         transforms: (M, 19).
-        near: (N, K) rows of the nodes of each splat.
-        weights: (N, K) of these nodes, out.
+        near: (N, K) rows of the points of each splat.
+        weights: (N, K) of these points, out.
         moved, turned, scaled: like the first three, out.
     """
     n, kept = near.shape
     padded = (kept + _LANES - 1) // _LANES * _LANES
-    rows = _lay_out(nodes, sharpness, transforms)
+    rows = _lay_out(points, sharpness, transforms)
     for block in prange(_BLOCKS):
         t, highest = np.empty(_WIDTH, np.float32), np.empty(_BATCH, np.float32)
         own = np.zeros(_BATCH * padded, np.float32)
@@ -260,7 +260,7 @@ def _move_backward(t, d_moved, d_turned, pull, i, d_means, d_quats):
 
 @inline
 def _follow_backward(rows, near, i, weights, d_t, at, totals, t, pull, sums):
-    """Add to the sums of a splat's nodes; write its transform, and what its weights add to d_means.
+    """Add to the sums of a splat's points; write its transform and what its weights add to d_means.
 
     Args:
         d_t, at: the gradient of its transform and its place, and where they begin.
@@ -300,8 +300,8 @@ def _is_finite(quats, weights, i):
 
 
 @inline
-def _sum_blocks(sums, j, d_nodes, d_log_radii, d_transforms):
-    """Write the gradients of a node, the sums of all blocks."""
+def _sum_blocks(sums, j, d_points, d_log_radii, d_transforms):
+    """Write the gradients of a point, the sums of all blocks."""
     at = j * _WIDTH
     low, high = simd.splat(_ZERO), simd.splat(_ZERO)
     for block in range(_BLOCKS):
@@ -313,28 +313,28 @@ def _sum_blocks(sums, j, d_nodes, d_log_radii, d_transforms):
         d_transforms[j, s] = sums[0, at + s]
     for s in range(3):
         d_transforms[j, GROWTH + s] = sums[0, at + _GROWTH + s]
-        d_nodes[j, s] = sums[0, at + _PLACE + s]
+        d_points[j, s] = sums[0, at + _PLACE + s]
     d_log_radii[j] = sums[0, at + _AGAIN] + sums[0, at + _AGAIN + 1] + sums[0, at + _AGAIN + 2]
 
 
 @parallel
 def skin_backward(
-    means, quats, nodes, sharpness, transforms, near, weights, d_moved, d_turned, d_scaled,
-    d_means, d_quats, d_nodes, d_log_radii, d_transforms,
+    means, quats, points, sharpness, transforms, near, weights, d_moved, d_turned, d_scaled,
+    d_means, d_quats, d_points, d_log_radii, d_transforms,
 ):  # fmt: skip
     """Write the gradients of ``skin``; that of the log scales is ``d_scaled``.
 
-    Splats that are not finite add nothing to their nodes' gradients.
+    Splats that are not finite add nothing to their points' gradients.
 
     Args:
         d_moved, d_turned, d_scaled: (N, 3), (N, 4), (N, 3).
         d_means, d_quats: (N, 3), (N, 4) out.
-        d_nodes: (M, 3) out, by the weights alone.
+        d_points: (M, 3) out, by the weights alone.
         d_log_radii, d_transforms: (M,), (M, 19) out.
     """
     n, kept = near.shape
-    count = nodes.shape[0]
-    rows = _lay_out(nodes, sharpness, transforms)
+    count = points.shape[0]
+    rows = _lay_out(points, sharpness, transforms)
     sums = simd.empty_aligned(_BLOCKS * count * _WIDTH).reshape((_BLOCKS, count * _WIDTH))
     for block in prange(_BLOCKS):
         t, pull = np.empty(_LANES, np.float32), np.empty(_LANES, np.float32)
@@ -347,11 +347,11 @@ def skin_backward(
                 at = (i - first) * _WIDTH
                 _transform_slopes(means, quats, d_moved, d_turned, d_scaled, i, d_t, at)
             for i in range(first, last):
-                if not _is_finite(quats, weights, i):  # 0 times NaN would be NaN to its nodes
+                if not _is_finite(quats, weights, i):  # 0 times NaN would be NaN to its points
                     d_means[i], d_quats[i] = d_moved[i], d_turned[i]
                     continue
                 at = (i - first) * _WIDTH
                 _follow_backward(rows, near, i, weights, d_t, at, totals, t, pull, own)
                 _move_backward(t, d_moved, d_turned, pull, i, d_means, d_quats)
     for j in prange(count):
-        _sum_blocks(sums, j, d_nodes, d_log_radii, d_transforms)
+        _sum_blocks(sums, j, d_points, d_log_radii, d_transforms)

@@ -18,25 +18,25 @@ COLUMNS = 19
 """Of a transform, as in skinning.cu."""
 
 _SUMS = 24
-"""Values that are added up for each node there."""
+"""Values that are added up for each point there."""
 
 _THREADS = 128
 
 
-def transforms(nodes: Tensor, deformation: Tensor, shortest: float) -> Tensor:
+def transforms(points: Tensor, deformation: Tensor, shortest: float) -> Tensor:
     """Return what ``ops.skin.transforms`` does, (M, 19).
 
     Args:
-        nodes, deformation: (M, 3), (M, 10).
+        points, deformation: (M, 3), (M, 10).
         shortest: quaternions count as this long at least.
     """
-    made: Tensor = _Transform.apply(nodes.contiguous(), deformation.contiguous(), shortest)
+    made: Tensor = _Transform.apply(points.contiguous(), deformation.contiguous(), shortest)
     return made
 
 
 def skin(
     stored: tuple[Tensor, Tensor, Tensor],
-    nodes: Tensor,
+    points: Tensor,
     log_radii: Tensor,
     transforms: Tensor,
     near: Tensor,
@@ -45,34 +45,34 @@ def skin(
 
     Args:
         stored: means (N, 3), quats (N, 4), log scales (N, 3).
-        nodes, log_radii, transforms: (M, 3), (M,), (M, 19).
+        points, log_radii, transforms: (M, 3), (M,), (M, 19).
         near: (N, K) int32.
     """
-    given = [t.contiguous() for t in (*stored, nodes, log_radii, transforms, near)]
+    given = [t.contiguous() for t in (*stored, points, log_radii, transforms, near)]
     moved: tuple[Tensor, Tensor, Tensor] = _Skin.apply(*given)
     return moved
 
 
 class _Transform(Function):
     @staticmethod
-    def forward(ctx: Any, nodes: Tensor, deformation: Tensor, shortest: float) -> Tensor:
-        made = nodes.new_empty(len(nodes), COLUMNS)
-        grid, given = (blocks(len(nodes), _THREADS), 1), (len(nodes), shortest)
-        launch("skinning", "transform", grid, _THREADS, *given, nodes, deformation, made)
+    def forward(ctx: Any, points: Tensor, deformation: Tensor, shortest: float) -> Tensor:
+        made = points.new_empty(len(points), COLUMNS)
+        grid, given = (blocks(len(points), _THREADS), 1), (len(points), shortest)
+        launch("skinning", "transform", grid, _THREADS, *given, points, deformation, made)
         ctx.grid, ctx.given = grid, given
-        ctx.save_for_backward(nodes, deformation, made)
+        ctx.save_for_backward(points, deformation, made)
         return made
 
     @staticmethod
     @once_differentiable  # type: ignore[untyped-decorator]
     def backward(ctx: Any, d_made: Tensor) -> tuple[Tensor | None, ...]:
-        nodes, deformation, made = ctx.saved_tensors
-        d_nodes, d_deformation = torch.empty_like(nodes), torch.empty_like(deformation)
+        points, deformation, made = ctx.saved_tensors
+        d_points, d_deformation = torch.empty_like(points), torch.empty_like(deformation)
         launch(
             "skinning", "transform_backward", ctx.grid, _THREADS,
-            *ctx.given, nodes, deformation, made, d_made.contiguous(), d_nodes, d_deformation,
+            *ctx.given, points, deformation, made, d_made.contiguous(), d_points, d_deformation,
         )  # fmt: skip
-        return d_nodes, d_deformation, None
+        return d_points, d_deformation, None
 
 
 class _Skin(Function):
@@ -91,14 +91,14 @@ class _Skin(Function):
     @staticmethod
     @once_differentiable  # type: ignore[untyped-decorator]
     def backward(ctx: Any, *given: Tensor) -> tuple[Tensor | None, ...]:
-        means, quats, nodes, log_radii, transforms, near, weights = ctx.saved_tensors
+        means, quats, points, log_radii, transforms, near, weights = ctx.saved_tensors
         d_moved, d_turned, d_scaled = (d.contiguous() for d in given)
         d_means, d_quats = torch.empty_like(means), torch.empty_like(quats)
-        sums = means.new_zeros(len(nodes), _SUMS)
+        sums = means.new_zeros(len(points), _SUMS)
         launch(
             "skinning", "skin_backward", (blocks(len(means), _THREADS), 1), _THREADS,
-            *near.shape, means, quats, nodes, log_radii, transforms, near, weights,
+            *near.shape, means, quats, points, log_radii, transforms, near, weights,
             d_moved, d_turned, d_scaled, d_means, d_quats, sums,
         )  # fmt: skip
-        d_transforms, d_nodes, d_log_radii, _ = sums.split([COLUMNS, 3, 1, 1], dim=1)
-        return d_means, d_quats, d_scaled, d_nodes, d_log_radii[:, 0], d_transforms, None
+        d_transforms, d_points, d_log_radii, _ = sums.split([COLUMNS, 3, 1, 1], dim=1)
+        return d_means, d_quats, d_scaled, d_points, d_log_radii[:, 0], d_transforms, None

@@ -1,10 +1,10 @@
-// Lets splats follow the nodes near them: search, blending of the nodes' transforms, gradients (linear blend
+// Lets splats follow the control points near them: blending of the points' transforms, gradients (linear blend
 // skinning; SC-GS, Huang et al., CVPR 2024, section 3.2).
 //
 // A transform has 19 columns, each the difference from what leaves a splat alone: a 3x3 matrix by rows and an
 // offset, which move a place x by (matrix x + offset); a quaternion, which turns q by (quaternion q); and an
 // offset of the log scales. Values are computed by a thread per splat. The sums over the splats that follow a
-// node are added by a warp: a lane per column, so that what a splat adds to a node is one access of 92 bytes.
+// point are added by a warp: a lane per column, so that what a splat adds to a point is one access of 92 bytes.
 #include "common.cuh"
 #include "distance.cuh"
 
@@ -13,7 +13,7 @@
 #define QUAT 12
 #define GROWTH 16
 #define COLUMNS 19
-#define SUMS 24      // per node: 19 columns, 3 of its place, 1 of its log radius, 1 unused
+#define SUMS 24      // per point: 19 columns, 3 of its place, 1 of its log radius, 1 unused
 #define ADDED 23     // of which so many are added to
 #define STRIDE 25    // of a splat's row in shared memory: odd, so that lanes use different banks
 
@@ -21,21 +21,21 @@ struct Quat {
     float w, x, y, z, norm;
 };
 
-// The quaternion of a node's deformation in unit length, and the length that it counts as having.
+// The quaternion of a point's deformation in unit length, and the length that it counts as having.
 __device__ __forceinline__ Quat turn_of(const float *deformation, float shortest) {
     float w = 1.0f + deformation[3], x = deformation[4], y = deformation[5], z = deformation[6];
     float norm = fmaxf(sqrtf(w * w + x * x + y * y + z * z), shortest);
     return {w / norm, x / norm, y / norm, z / norm, norm};
 }
 
-// Writes what nodes do to the splats that follow them, (count, 19), from their places and deformations (count,
-// 10): offsets of place, of the quaternion (1, 0, 0, 0), of log scales. It counts as `shortest` long at least.
+// Writes what control points do to the splats that follow them, (count, 19), from their places and deformations
+// (count, 10): offsets of place, of the quaternion (1, 0, 0, 0), of log scales. It counts as `shortest` long at least.
 extern "C" __global__ void __launch_bounds__(THREADS) transform(
-    int count, float shortest, const float *nodes, const float *deformation, float *transforms
+    int count, float shortest, const float *points, const float *deformation, float *transforms
 ) {
     int j = blockIdx.x * THREADS + threadIdx.x;
     if (j >= count) return;
-    const float *node = nodes + 3 * (size_t)j, *d = deformation + 10 * (size_t)j;
+    const float *point = points + 3 * (size_t)j, *d = deformation + 10 * (size_t)j;
     float *out = transforms + COLUMNS * (size_t)j;
     Quat q = turn_of(d, shortest);
     float m[9] = {
@@ -49,7 +49,7 @@ extern "C" __global__ void __launch_bounds__(THREADS) transform(
 #pragma unroll
         for (int s = 0; s < 3; s++) {
             out[3 * r + s] = m[3 * r + s];
-            shift -= m[3 * r + s] * node[s];
+            shift -= m[3 * r + s] * point[s];
         }
         out[OFFSET + r] = shift;
         out[GROWTH + r] = d[7 + r];
@@ -57,14 +57,14 @@ extern "C" __global__ void __launch_bounds__(THREADS) transform(
     out[QUAT] = q.w - 1.0f, out[QUAT + 1] = q.x, out[QUAT + 2] = q.y, out[QUAT + 3] = q.z;
 }
 
-// Writes the gradients of that, d_nodes (count, 3) and d_deformation (count, 10).
+// Writes the gradients of that, d_points (count, 3) and d_deformation (count, 10).
 extern "C" __global__ void __launch_bounds__(THREADS) transform_backward(
-    int count, float shortest, const float *nodes, const float *deformation,
-    const float *transforms, const float *d_transforms, float *d_nodes, float *d_deformation
+    int count, float shortest, const float *points, const float *deformation,
+    const float *transforms, const float *d_transforms, float *d_points, float *d_deformation
 ) {
     int j = blockIdx.x * THREADS + threadIdx.x;
     if (j >= count) return;
-    const float *node = nodes + 3 * (size_t)j, *t = transforms + COLUMNS * (size_t)j;
+    const float *point = points + 3 * (size_t)j, *t = transforms + COLUMNS * (size_t)j;
     const float *given = d_transforms + COLUMNS * (size_t)j;
     float *out = d_deformation + 10 * (size_t)j;
     float m[9];
@@ -73,10 +73,10 @@ extern "C" __global__ void __launch_bounds__(THREADS) transform_backward(
         float pull = 0.0f;
 #pragma unroll
         for (int r = 0; r < 3; r++) {
-            m[3 * r + s] = given[3 * r + s] - given[OFFSET + r] * node[s];
+            m[3 * r + s] = given[3 * r + s] - given[OFFSET + r] * point[s];
             pull -= given[OFFSET + r] * t[3 * r + s];
         }
-        d_nodes[3 * (size_t)j + s] = pull;
+        d_points[3 * (size_t)j + s] = pull;
         out[s] = given[OFFSET + s], out[7 + s] = given[GROWTH + s];
     }
     Quat q = turn_of(deformation + 10 * (size_t)j, shortest);
@@ -95,7 +95,7 @@ extern "C" __global__ void __launch_bounds__(THREADS) transform_backward(
 
 __device__ __forceinline__ float sharpness_of(float log_radius) { return expf(-2.0f * log_radius); }
 
-// The mean of the transforms of a splat's nodes, in t (19 registers).
+// The mean of the transforms of a splat's points, in t (19 registers).
 __device__ __forceinline__ void blend_into(
     float *t, const float *transforms, int kept, const int *near, const float *weights
 ) {
@@ -109,11 +109,11 @@ __device__ __forceinline__ void blend_into(
     }
 }
 
-// Writes n splats where their nodes take them, and weights (n, kept): softmax(-d^2 / (2 r^2)) of the distances
-// d to the nodes and their radii r.
+// Writes n splats where their points take them, and weights (n, kept): softmax(-d^2 / (2 r^2)) of the distances
+// d to the points and their radii r.
 extern "C" __global__ void __launch_bounds__(THREADS) skin(
     int n, int kept, const float *means, const float *quats, const float *log_scales,
-    const float *nodes, const float *log_radii, const float *transforms, const int *near,
+    const float *points, const float *log_radii, const float *transforms, const int *near,
     float *weights, float *moved, float *turned, float *scaled
 ) {
     int i = blockIdx.x * THREADS + threadIdx.x;
@@ -125,7 +125,7 @@ extern "C" __global__ void __launch_bounds__(THREADS) skin(
     float highest = -LARGEST, total = 0.0f;
     for (int k = 0; k < kept; k++) {
         int j = own[k];
-        weight[k] = -0.5f * square_to(x, y, z, nodes + 3 * (size_t)j) * sharpness_of(log_radii[j]);
+        weight[k] = -0.5f * square_to(x, y, z, points + 3 * (size_t)j) * sharpness_of(log_radii[j]);
         highest = fmaxf(highest, weight[k]);
     }
     for (int k = 0; k < kept; k++) {
@@ -181,8 +181,8 @@ __device__ __forceinline__ float pass_on(
     return mean;
 }
 
-// Adds the k-th rows of a warp's splats to the sums of their nodes. What splats in a row add to the same node
-// is added up first: where nodes are few, one addition takes the place of up to 32 that wait for each other.
+// Adds the k-th rows of a warp's splats to the sums of their points. What splats in a row add to the same point
+// is added up first: where points are few, one addition takes the place of up to 32 that wait for each other.
 __device__ __forceinline__ void add_rows(
     const float (*rows)[STRIDE], const int *followed, const float *weights, unsigned taught, int lane,
     float *sums
@@ -198,12 +198,12 @@ __device__ __forceinline__ void add_rows(
     }
 }
 
-// Writes the gradients of that by means and quaternions, and adds those by the nodes to sums (count, 24),
+// Writes the gradients of that by means and quaternions, and adds those by the points to sums (count, 24),
 // which begin as 0. That of log scales is d_scaled.
 //
 // A splat that is given no gradient adds nothing, whatever its values are: 0 times NaN would be NaN.
 extern "C" __global__ void __launch_bounds__(THREADS) skin_backward(
-    int n, int kept, const float *means, const float *quats, const float *nodes,
+    int n, int kept, const float *means, const float *quats, const float *points,
     const float *log_radii, const float *transforms, const int *near, const float *weights,
     const float *d_moved, const float *d_turned, const float *d_scaled, float *d_means,
     float *d_quats, float *sums
@@ -233,12 +233,12 @@ extern "C" __global__ void __launch_bounds__(THREADS) skin_backward(
         __syncwarp();
         if (own) {
             int j = rows_of_nodes[k];
-            const float *node = nodes + 3 * (size_t)j, *transform = transforms + COLUMNS * (size_t)j;
+            const float *point = points + 3 * (size_t)j, *transform = transforms + COLUMNS * (size_t)j;
             float total = 0.0f;
 #pragma unroll
             for (int s = 0; s < COLUMNS; s++) total += transform[s] * row[s];
             float given = weight[k] * (total - average) * sharpness_of(log_radii[j]);
-            float away[3] = {x - node[0], y - node[1], z - node[2]};
+            float away[3] = {x - point[0], y - point[1], z - point[2]};
 #pragma unroll
             for (int s = 0; s < 3; s++) {
                 row[COLUMNS + s] = given * away[s];

@@ -16,28 +16,28 @@ COLUMNS = [9, 3, 4, 3]
 """Columns of a transform: matrix, offset, quaternion, log scales; see ``ops.skin.cpu``."""
 
 
-def transforms_twin(nodes: Tensor, deformation: Tensor) -> Tensor:
+def transforms_twin(points: Tensor, deformation: Tensor) -> Tensor:
     """Return what ``transforms`` does, in plain torch, for any device and dtype."""
     offset, turn, growth = deformation.split(PARTS, dim=1)
     nothing = torch.zeros_like(turn)
     nothing[:, 0] = 1
     quats = torch.nn.functional.normalize(nothing + turn, dim=1, eps=SHORTEST)
     matrix = quat_to_rotmat(quats) - torch.eye(3, dtype=turn.dtype, device=turn.device)
-    shift = offset - (matrix @ nodes[:, :, None])[:, :, 0]
+    shift = offset - (matrix @ points[:, :, None])[:, :, 0]
     return torch.cat([matrix.flatten(1), shift, quats - nothing, growth], dim=1)
 
 
 def skin_twin(
-    splats: Splats, nodes: Tensor, log_radii: Tensor, transforms: Tensor, near: Tensor
+    splats: Splats, points: Tensor, log_radii: Tensor, transforms: Tensor, near: Tensor
 ) -> Splats:
     """Return what ``skin`` does, in plain torch, for any device and dtype.
 
     Values that are not finite count as 0 in products: else a splat that passes no gradient would
-    pass NaN to the nodes, which are shared. What it goes to is not finite all the same.
+    pass NaN to the points, which are shared. What it goes to is not finite all the same.
     """
     rows = near.long()
     means, quats = (torch.where(t.isfinite(), t, 0.0) for t in (splats.means, splats.quats))
-    squares = (means[:, None] - nodes[rows]).square().sum(dim=2)
+    squares = (means[:, None] - points[rows]).square().sum(dim=2)
     weights = torch.softmax(-0.5 * squares * torch.exp(-2 * log_radii)[rows], dim=1)
     blend = (weights[:, :, None] * transforms[rows]).sum(dim=1)
     matrix, shift, turn, growth = blend.split(COLUMNS, dim=1)

@@ -1,4 +1,4 @@
-"""Spreads nodes over splats: farthest-point sampling of points that a grid has made few."""
+"""Spreads control points over splats: farthest-point sampling after a grid has made them few."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from gsdmsr_cli.ops.neighbours.cpu import mean_squares, near_order
 from gsdmsr_cli.ops.spread import cpu as kernels
 
 CANDIDATES = 32
-"""Nodes are chosen among so many points for each of them, or up to twice as many."""
+"""Points are chosen among so many for each of them, or up to twice as many."""
 
 SPACING_OF = 3
-"""How many of the nearest other nodes say how far apart nodes are."""
+"""How many of the nearest others say how far apart points are."""
 
 _BITS = 20
 """Of a coordinate in a Morton code."""
@@ -25,12 +25,12 @@ _STRETCHES = (
 """By how much to shift and what to keep, to make room for two bits between any two of 21."""
 
 
-def spread_nodes(points: Tensor, count: int) -> Tensor:
+def spread_out(points: Tensor, count: int) -> Tensor:
     """Return ``count`` of the points (N, 3) that are far from each other, on the CPU.
 
     Some repeatedly if there are fewer. Points are looked at on their device; what comes to the CPU
     is at most ``2 CANDIDATES count`` of them, but for clouds most of which lie within a millionth
-    of their extent. Nodes that follow each other lie near each other, which makes
+    of their extent. Chosen points that follow each other lie near each other, which makes
     ``ops.nearest`` quick.
 
     Args:
@@ -41,8 +41,8 @@ def spread_nodes(points: Tensor, count: int) -> Tensor:
     given = points.detach()[rows].cpu().double().contiguous()
     chosen = torch.empty(count, dtype=torch.int64)
     kernels.choose_spread(array(given), int(rows.argmin()), array(chosen))
-    nodes = given[chosen]
-    return nodes[torch.from_numpy(near_order(array(nodes)))].float()
+    found = given[chosen]
+    return found[torch.from_numpy(near_order(array(found)))].float()
 
 
 def _candidates(points: Tensor, least: int) -> Tensor:
@@ -76,7 +76,7 @@ def _morton(points: Tensor) -> Tensor:
     return codes
 
 
-def spacing(nodes: Tensor) -> Tensor:
-    """Return the root mean square of the distances of each node to its nearest others, (M,)."""
-    squares = mean_squares(array(nodes.detach().cpu().double().contiguous()), SPACING_OF)
+def spacing(points: Tensor) -> Tensor:
+    """Return the root mean square of the distances of each point to its nearest others, (M,)."""
+    squares = mean_squares(array(points.detach().cpu().double().contiguous()), SPACING_OF)
     return torch.from_numpy(squares).sqrt().float()

@@ -1,4 +1,4 @@
-"""Splats that follow control points: the twin by hand, kernels against the twin and SciPy."""
+"""Splats that follow control points: the twin by hand, kernels against the twin."""
 
 from __future__ import annotations
 
@@ -6,34 +6,31 @@ import math
 
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from kernel_checks import assert_near, assert_same_on_threads, generator, leaves
 from motion_checks import splats_of
-from scipy.spatial import cKDTree
-from skinning_checks import Move, guesses, learnt_from_33, nodes_of
+from skinning_checks import Move, control_points_of, guesses, learnt_from_33
 from torch import Tensor
 
 from gsdmsr_cli.gaussians.splats import Splats
 from gsdmsr_cli.ground.geometry import quat_to_rotmat
 from gsdmsr_cli.model.motion._rigidity import rigidity
 from gsdmsr_cli.ops.displace import OUTPUTS
-from gsdmsr_cli.ops.nearest import nearest_nodes
+from gsdmsr_cli.ops.nearest import nearest_points
 from gsdmsr_cli.ops.skin import skin, skin_twin, transforms, transforms_twin
 from gsdmsr_cli.ops.spread import spacing
 
 
 @pytest.mark.parametrize("move", [skin, skin_twin])
-def test_one_node_takes_splats_along_as_a_rigid_body(move: object) -> None:
-    """A quarter turn about z around the node, then its offset; the ellipsoids turn as well."""
+def test_one_point_takes_splats_along_as_a_rigid_body(move: object) -> None:
+    """A quarter turn about z around the point, then its offset; the ellipsoids turn as well."""
     assert callable(move)
-    node, offset = torch.tensor([[1.0, 2.0, 3.0]]), torch.tensor([[0.1, 0.2, 0.3]])
+    point, offset = torch.tensor([[1.0, 2.0, 3.0]]), torch.tensor([[0.1, 0.2, 0.3]])
     turn = torch.tensor([[math.cos(math.pi / 4) - 1, 0.0, 0.0, math.sin(math.pi / 4)]])
     deformation = torch.cat([offset, turn, torch.full((1, 3), 0.5)], dim=1)
     splats = splats_of(5)
-    moved = move(splats, node, torch.zeros(1), transforms(node, deformation), guesses(5, 1))
-    x, y, z = (splats.means - node).unbind(1)
-    expected = torch.stack([-y, x, z], dim=1) + node + offset
+    moved = move(splats, point, torch.zeros(1), transforms(point, deformation), guesses(5, 1))
+    x, y, z = (splats.means - point).unbind(1)
+    expected = torch.stack([-y, x, z], dim=1) + point + offset
     torch.testing.assert_close(moved.means, expected, rtol=1e-5, atol=1e-6)
     quarter = torch.tensor([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
     turned = quarter @ quat_to_rotmat(splats.quats)
@@ -42,55 +39,55 @@ def test_one_node_takes_splats_along_as_a_rigid_body(move: object) -> None:
     assert moved.sh is splats.sh and moved.logit_opacities is splats.logit_opacities
 
 
-def test_nearer_nodes_weigh_more_and_radii_say_by_how_much() -> None:
-    """Two nodes at distance 1 and 2 of radius 1: weights 1 : exp(-(4 - 1) / 2)."""
-    nodes = torch.tensor([[1.0, 0.0, 0.0], [-2.0, 0.0, 0.0]])
+def test_nearer_points_weigh_more_and_radii_say_by_how_much() -> None:
+    """Two points at distance 1 and 2 of radius 1: weights 1 : exp(-(4 - 1) / 2)."""
+    points = torch.tensor([[1.0, 0.0, 0.0], [-2.0, 0.0, 0.0]])
     deformation = torch.zeros(2, OUTPUTS)
     deformation[0, 1], deformation[1, 2] = 1.0, 1.0
     splats = splats_of(1)
     splats.means.zero_()
     near = torch.tensor([[0, 1]], dtype=torch.int32)
-    moved = skin(splats, nodes, torch.zeros(2), transforms(nodes, deformation), near)
+    moved = skin(splats, points, torch.zeros(2), transforms(points, deformation), near)
     second = 1 / (1 + math.exp(1.5))
     torch.testing.assert_close(moved.means, torch.tensor([[0.0, 1 - second, second]]))
 
 
-def test_rigid_nodes_are_rigid() -> None:
+def test_rigid_points_are_rigid() -> None:
     """All of them turn about one axis that is none of theirs, and go on."""
-    nodes, _, _ = nodes_of(30)
+    points, _, _ = control_points_of(30)
     turn = torch.nn.functional.normalize(torch.tensor([[1.0, 0.2, -0.4, 0.3]]))
-    goes = nodes @ quat_to_rotmat(turn)[0].T + torch.tensor([0.5, -2.0, 1.0])
+    goes = points @ quat_to_rotmat(turn)[0].T + torch.tensor([0.5, -2.0, 1.0])
     rest = torch.tensor([[1.0, 0.0, 0.0, 0.0]])
     deformation = torch.cat(
-        [goes - nodes, (turn - rest).expand(30, 4), torch.zeros(30, 3)], dim=1
+        [goes - points, (turn - rest).expand(30, 4), torch.zeros(30, 3)], dim=1
     ).requires_grad_()
-    near = nearest_nodes(nodes, nodes, guesses(30, 5))
-    value = rigidity(nodes, transforms(nodes, deformation), near)
+    near = nearest_points(points, points, guesses(30, 5))
+    value = rigidity(points, transforms(points, deformation), near)
     value.backward()
     assert 0 <= value < 1e-9
     assert deformation.grad is not None and deformation.grad.abs().max() < 1e-5
     bent = deformation.detach().clone()
     bent[3, 4:7] += 0.1
-    assert rigidity(nodes, transforms(nodes, bent), near) > 1e-5
+    assert rigidity(points, transforms(points, bent), near) > 1e-5
 
 
 def test_rigidity_is_relative_to_the_distance() -> None:
-    """Two nodes 2 apart, one of which goes 0.3 away: 0.15 squared, in half of the pairs."""
-    nodes = torch.tensor([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0]])
+    """Two points 2 apart, one of which goes 0.3 away: 0.15 squared, in half of the pairs."""
+    points = torch.tensor([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0]])
     deformation = torch.zeros(2, OUTPUTS)
     deformation[0, 1] = 0.3
     near = torch.tensor([[0, 1], [0, 1]], dtype=torch.int32)
     for unit in (1.0, 7.0):
         deformation[0, 1] = 0.3 * unit
-        value = rigidity(unit * nodes, transforms(unit * nodes, deformation), near)
+        value = rigidity(unit * points, transforms(unit * points, deformation), near)
         torch.testing.assert_close(value, torch.tensor(0.5 * 0.15**2))
 
 
-def test_nodes_at_one_place_are_rigid_with_each_other() -> None:
-    nodes = torch.tensor([[1.0, 2.0, 3.0], [1.0, 2.0, 3.0], [0.0, 0.0, 0.0]])
+def test_points_at_one_place_are_rigid_with_each_other() -> None:
+    points = torch.tensor([[1.0, 2.0, 3.0], [1.0, 2.0, 3.0], [0.0, 0.0, 0.0]])
     deformation = torch.zeros(3, OUTPUTS, requires_grad=True)
     near = torch.tensor([[0, 1], [0, 1], [0, 2]], dtype=torch.int32)
-    value = rigidity(nodes, transforms(nodes, deformation), near)
+    value = rigidity(points, transforms(points, deformation), near)
     value.backward()
     assert value == 0
     assert deformation.grad is not None and not deformation.grad.any()
@@ -99,17 +96,17 @@ def test_nodes_at_one_place_are_rigid_with_each_other() -> None:
 @pytest.mark.parametrize(("count", "kept"), [(0, 4), (1, 1), (333, 4), (200, 20)])
 def test_the_kernel_matches_the_twin(count: int, kept: int) -> None:
     results = []
-    near = nearest_nodes(splats_of(count).means, nodes_of(20)[0], guesses(count, kept))
+    near = nearest_points(splats_of(count).means, control_points_of(20)[0], guesses(count, kept))
     for move, dtype in ((skin, torch.float32), (skin_twin, torch.float64)):
         splats = splats_of(count).map(lambda t, to=dtype: t.to(to, copy=True).requires_grad_())
-        nodes, log_radii, deformation = leaves(nodes_of(20), dtype)
-        moved = move(splats, nodes, log_radii, transforms(nodes, deformation), near)
+        points, log_radii, deformation = leaves(control_points_of(20), dtype)
+        moved = move(splats, points, log_radii, transforms(points, deformation), near)
         parts = [moved.means, moved.quats, moved.log_scales]
         rng = generator(5)
         loss = sum((part * torch.randn(part.shape, generator=rng)).sum() for part in parts)
         assert isinstance(loss, Tensor)
         loss.backward()
-        inputs = [splats.means, splats.quats, splats.log_scales, nodes, log_radii, deformation]
+        inputs = [splats.means, splats.quats, splats.log_scales, points, log_radii, deformation]
         results.append([*parts, *(tensor.grad for tensor in inputs)])
     for i, (found, exact) in enumerate(zip(*results, strict=True)):
         assert_near(found, exact, 1e-5, str(i))
@@ -119,14 +116,14 @@ def test_the_kernel_of_transforms_matches_the_twin() -> None:
     """Also where a quaternion is much shorter or longer than 1, or has no length at all."""
     results = []
     for make, dtype in ((transforms, torch.float32), (transforms_twin, torch.float64)):
-        places, _, given = nodes_of(40)
+        places, _, given = control_points_of(40)
         given[0], given[1, 3:7], given[2, 3:7] = 0.0, 3.0, torch.tensor([-0.99, 0.0, 0.01, 0.0])
         given[3, 3:7] = torch.tensor([-1.0, 0.0, 0.0, 0.0])
-        nodes, deformation = leaves([places, given], dtype)
-        made = make(nodes, deformation)
+        points, deformation = leaves([places, given], dtype)
+        made = make(points, deformation)
         weights = torch.randn(made.shape, generator=generator(5)).to(dtype)
         (made * weights).sum().backward()
-        results.append([made, nodes.grad, deformation.grad])
+        results.append([made, points.grad, deformation.grad])
     for found, expected in zip(*results, strict=True):
         assert found is not None and expected is not None
         torch.testing.assert_close(found.double(), expected, rtol=1e-4, atol=1e-4)
@@ -134,43 +131,16 @@ def test_the_kernel_of_transforms_matches_the_twin() -> None:
 
 def test_the_twin_s_gradients_are_those_of_finite_differences() -> None:
     stored = splats_of(3).map(lambda t: t.double())
-    near = nearest_nodes(stored.means, nodes_of(6)[0].double(), guesses(3, 3))
+    near = nearest_points(stored.means, control_points_of(6)[0].double(), guesses(3, 3))
 
     def moved(means: Tensor, quats: Tensor, *by: Tensor) -> tuple[Tensor, ...]:
-        nodes, log_radii, deformation = by
+        points, log_radii, deformation = by
         own = Splats(means, quats, stored.log_scales, stored.logit_opacities, stored.sh)
-        found = skin_twin(own, nodes, log_radii, transforms(nodes, deformation), near)
+        found = skin_twin(own, points, log_radii, transforms(points, deformation), near)
         return found.means, found.quats, found.log_scales
 
-    given = leaves([stored.means, stored.quats, *nodes_of(6)], torch.float64)
+    given = leaves([stored.means, stored.quats, *control_points_of(6)], torch.float64)
     assert torch.autograd.gradcheck(moved, given)
-
-
-@settings(max_examples=40, deadline=None)
-@given(st.integers(1, 200), st.integers(1, 70), st.integers(1, 9), st.integers(0, 2**31))
-def test_the_nearest_nodes_are_what_scipy_finds_whatever_the_guess(
-    count: int, size: int, kept: int, seed: int
-) -> None:
-    rng = generator(seed)
-    points, nodes = torch.randn(count, 3, generator=rng), torch.randn(size, 3, generator=rng)
-    kept = min(kept, size)
-    exact = cKDTree(nodes.double()).query(points.double(), k=kept)[0].reshape(count, kept)
-    found = nearest_nodes(points, nodes, guesses(count, kept))
-    assert all(row == sorted(set(row)) and len(row) == kept for row in found.tolist())
-    near_by = points + 0.1 * torch.randn(count, 3, generator=rng)
-    guess = nearest_nodes(near_by, nodes, guesses(count, kept))
-    for other in (found, guess, torch.randint(size, (count, kept), generator=rng).int()):
-        assert torch.equal(nearest_nodes(points, nodes, other), found)
-    twin = nearest_nodes(points.double(), nodes.double(), guess)
-    for near in (found, twin):
-        distances = (points[:, None] - nodes[near.long()]).norm(dim=2).sort(dim=1).values.double()
-        torch.testing.assert_close(distances, torch.from_numpy(exact), rtol=1e-5, atol=1e-5)
-
-
-def test_of_equally_near_nodes_the_first_are_found() -> None:
-    nodes = torch.tensor([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0]] * 9)
-    found = nearest_nodes(torch.zeros(2, 3), nodes, guesses(2, 3))
-    assert found.tolist() == [[0, 1, 2]] * 2
 
 
 @pytest.mark.parametrize(
@@ -184,13 +154,13 @@ def test_splats_that_are_not_finite_teach_nothing(move: Move, dtype: torch.dtype
         assert other.any() and torch.equal(one, other)
 
 
-def test_a_node_that_is_followed_alone_learns_nothing_by_its_weight() -> None:
+def test_a_point_that_is_followed_alone_learns_nothing_by_its_weight() -> None:
     """The weight is 1 wherever it is: no gradient to its place and radius, not the least."""
     splats = splats_of(300)
-    nodes, log_radii, deformation = nodes_of(20)
-    made = transforms(nodes, deformation).requires_grad_()
-    own = leaves([nodes, log_radii], torch.float32)
-    near = nearest_nodes(splats.means, nodes, guesses(300, 1))
+    points, log_radii, deformation = control_points_of(20)
+    made = transforms(points, deformation).requires_grad_()
+    own = leaves([points, log_radii], torch.float32)
+    near = nearest_points(splats.means, points, guesses(300, 1))
     moved = skin(splats, own[0], own[1], made, near)
     (moved.means.square().sum() + moved.quats.sum() + moved.log_scales.sum()).backward()
     assert made.grad is not None and made.grad.any()
@@ -207,24 +177,24 @@ def test_spacing_is_that_of_a_lattice() -> None:
 def test_results_do_not_depend_on_the_number_of_threads() -> None:
     def compute() -> list[Tensor]:
         splats = splats_of(500).map(torch.nn.Parameter)
-        nodes, log_radii, deformation = leaves(nodes_of(40), torch.float32)
-        near = nearest_nodes(splats.means, nodes, guesses(500, 4))
-        moved = skin(splats, nodes, log_radii, transforms(nodes, deformation), near)
+        points, log_radii, deformation = leaves(control_points_of(40), torch.float32)
+        near = nearest_points(splats.means, points, guesses(500, 4))
+        moved = skin(splats, points, log_radii, transforms(points, deformation), near)
         (moved.means.square().sum() + moved.quats.square().sum()).backward()
-        found = [splats.means, splats.quats, nodes, log_radii, deformation]
+        found = [splats.means, splats.quats, points, log_radii, deformation]
         gradients = [tensor.grad for tensor in found]
         return [near, moved.means, *(g for g in gradients if g is not None)]
 
     assert_same_on_threads(compute)
 
 
-def test_splats_far_from_all_nodes_follow_the_nearest() -> None:
+def test_splats_far_from_all_points_follow_the_nearest() -> None:
     """At any distance, since powers of 2 overflow at one and wrap round at another."""
-    splats, (nodes, log_radii, deformation) = splats_of(4000), nodes_of(20)
+    splats, (points, log_radii, deformation) = splats_of(4000), control_points_of(20)
     splats.means[:3000, 0] += torch.linspace(0, 12, 3000)
     splats.means[1000] = float("nan")  # which those after it have nothing to do with
-    near = nearest_nodes(splats.means, nodes, guesses(4000, 5))
-    given = nodes, torch.full_like(log_radii, -1.5), transforms(nodes, deformation), near
+    near = nearest_points(splats.means, points, guesses(4000, 5))
+    given = points, torch.full_like(log_radii, -1.5), transforms(points, deformation), near
     found, exact = skin(splats, *given), skin_twin(splats, *given)
     finite = torch.arange(4000) != 1000
     for name in ("means", "quats", "log_scales"):

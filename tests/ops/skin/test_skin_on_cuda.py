@@ -9,13 +9,13 @@ import pytest
 import torch
 from kernel_checks import assert_near, generator, leaves
 from motion_checks import disturbed, moved_by, penalty_of, splats_of, started
-from skinning_checks import guesses, learnt_from_33, nodes_of
+from skinning_checks import control_points_of, guesses, learnt_from_33
 from torch import Tensor
 
 from gsdmsr_cli.backends.cuda import launch
 from gsdmsr_cli.gaussians.splats import Splats
 from gsdmsr_cli.ops import skin as skinning
-from gsdmsr_cli.ops.nearest import nearest_nodes
+from gsdmsr_cli.ops.nearest import nearest_points
 
 pytestmark = pytest.mark.usefixtures("kernels_on_the_cpu")
 
@@ -53,31 +53,31 @@ def lattice(count: int, seed: int) -> Tensor:
 def test_the_nearest_are_those_of_the_cpu_also_where_equally_near(
     turns: None, count: int, size: int, kept: int
 ) -> None:
-    points, nodes = lattice(count, 1), lattice(size, 2)
-    (expected,) = by_the_cpu(lambda: [nearest_nodes(points, nodes, guesses(count, kept))])
+    queries, points = lattice(count, 1), lattice(size, 2)
+    (expected,) = by_the_cpu(lambda: [nearest_points(queries, points, guesses(count, kept))])
     rows = torch.randint(size, (count, kept), generator=generator(3)).int()
     for guess in (guesses(count, kept), expected, rows, rows.sort(dim=1).values):
-        assert torch.equal(nearest_nodes(points, nodes, guess), expected)
+        assert torch.equal(nearest_points(queries, points, guess), expected)
 
 
 @pytest.mark.parametrize("kept", [1, 8, 11])
 @pytest.mark.parametrize("count", COUNTS)
 def test_the_nearest_are_those_of_the_twin(place: str, count: int, kept: int) -> None:
-    points, nodes = splats_of(count).means, nodes_of(70)[0]
+    queries, points = splats_of(count).means, control_points_of(70)[0]
     guess = guesses(count, kept)
-    expected = nearest_nodes(points.double(), nodes.double(), guess)
-    given = points.to(place), nodes.to(place)
-    assert torch.equal(nearest_nodes(*given, guess.to(place)).cpu(), expected)
+    expected = nearest_points(queries.double(), points.double(), guess)
+    given = queries.to(place), points.to(place)
+    assert torch.equal(nearest_points(*given, guess.to(place)).cpu(), expected)
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), 1e30])
 @pytest.mark.parametrize("kept", [1, 8, 11])
 def test_points_that_are_nowhere_get_valid_rows(kept: int, value: float) -> None:
-    points, nodes = splats_of(33).means, nodes_of(20)[0]
-    expected = nearest_nodes(points, nodes, guesses(33, kept))
-    points[7, 1] = value
+    queries, points = splats_of(33).means, control_points_of(20)[0]
+    expected = nearest_points(queries, points, guesses(33, kept))
+    queries[7, 1] = value
     for guess in (guesses(33, kept), expected):
-        found = nearest_nodes(points, nodes, guess)
+        found = nearest_points(queries, points, guess)
         assert found[7].min() >= 0 and found[7].max() < 20
         found[7] = expected[7]
         assert torch.equal(found, expected)
@@ -91,7 +91,7 @@ def test_transforms_and_their_gradients(place: str, turns: None, size: int) -> N
         (skinning.transforms, torch.float32),
         (skinning.transforms_twin, torch.float64),
     ):
-        places, _, deformation = nodes_of(size)
+        places, _, deformation = control_points_of(size)
         deformation[0, 3:7] = torch.tensor([-1.0, 0.0, 0.0, 0.0])
         deformation[-1, 3:7] = torch.tensor([-0.99, 0.0, 0.01, 0.0])
         own = leaves([places, deformation], dtype)
@@ -107,11 +107,11 @@ def moved_and_learnt(
 ) -> list[Tensor]:
     """Return what splats become, and the gradients of all that they follow from."""
     assert callable(move)
-    splats, nodes = splats_of(count), nodes_of(size)
-    near = nearest_nodes(splats.means.double(), nodes[0].double(), guesses(count, kept))
+    splats, points = splats_of(count), control_points_of(size)
+    near = nearest_points(splats.means.double(), points[0].double(), guesses(count, kept))
     stored = [splats.means, splats.quats, splats.log_scales]
-    made = skinning.transforms_twin(nodes[0].double(), nodes[2].double())
-    own = leaves([*stored, nodes[0], nodes[1], made], dtype)
+    made = skinning.transforms_twin(points[0].double(), points[2].double())
+    own = leaves([*stored, points[0], points[1], made], dtype)
     there = [t.to(place) for t in own]
     moving = Splats(*there[:3], *(t.to(place) for t in (splats.logit_opacities, splats.sh)))
     moved = move(moving, *there[3:], near.to(place))

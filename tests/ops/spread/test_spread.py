@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from gsdmsr_cli.ops import spread as spreading
-from gsdmsr_cli.ops.spread import CANDIDATES, spread_nodes
+from gsdmsr_cli.ops.spread import CANDIDATES, spread_out
 
 
 def clouds() -> dict[str, Tensor]:
@@ -28,10 +28,10 @@ def clouds() -> dict[str, Tensor]:
     }
 
 
-def cover(points: Tensor, nodes: Tensor) -> tuple[float, float]:
+def cover(points: Tensor, chosen: Tensor) -> tuple[float, float]:
     """Return the largest distance to the nearest control point, and the least between two."""
-    tree = cKDTree(nodes)
-    return tree.query(points)[0].max(), tree.query(nodes, k=2)[0][:, 1].min()
+    tree = cKDTree(chosen)
+    return tree.query(points)[0].max(), tree.query(chosen, k=2)[0][:, 1].min()
 
 
 @pytest.mark.parametrize("name", ["box", "sphere", "clumps"])
@@ -41,9 +41,9 @@ def test_few_candidates_cover_nearly_as_well_as_all_points(
 ) -> None:
     points = clouds()[name]
     assert CANDIDATES * count < len(points)
-    reach, apart = cover(points, spread_nodes(points, count))
+    reach, apart = cover(points, spread_out(points, count))
     monkeypatch.setattr(spreading, "CANDIDATES", len(points))
-    best, spaced = cover(points, spread_nodes(points, count))
+    best, spaced = cover(points, spread_out(points, count))
     assert reach <= 1.15 * best
     assert apart >= 0.85 * spaced
 
@@ -66,25 +66,25 @@ def test_candidates_lie_on_their_device_and_are_the_same_there(place: str) -> No
     found = spreading._candidates(points.to(place), 500)
     assert found.device.type == place
     assert torch.equal(found.cpu(), spreading._candidates(points, 500))
-    assert torch.equal(spread_nodes(points.to(place), 9), spread_nodes(points, 9))
+    assert torch.equal(spread_out(points.to(place), 9), spread_out(points, 9))
 
 
-def test_nodes_spread_from_end_to_end() -> None:
+def test_points_spread_from_end_to_end() -> None:
     points = torch.zeros(101, 3)
     points[:, 1] = torch.linspace(0, 1, 101)
-    nodes = spread_nodes(points[torch.randperm(101, generator=generator())], 5)
-    ends = nodes[:, 1].sort().values
+    chosen = spread_out(points[torch.randperm(101, generator=generator())], 5)
+    ends = chosen[:, 1].sort().values
     assert ends[0] == 0 and ends[-1] == 1
     assert float(ends.diff().min()) > 0.1
 
 
 @pytest.mark.parametrize("size", [1, 2, 7])
-def test_fewer_points_than_nodes_are_taken_repeatedly(size: int) -> None:
+def test_fewer_points_than_wanted_are_taken_repeatedly(size: int) -> None:
     points = torch.randn(size, 3, generator=generator())
-    nodes = spread_nodes(points, 8)
-    assert len(nodes) == 8
-    assert are_among(points, nodes) and are_among(nodes, points)
+    chosen = spread_out(points, 8)
+    assert len(chosen) == 8
+    assert are_among(points, chosen) and are_among(chosen, points)
 
 
 def test_points_at_one_place_are_spread() -> None:
-    assert spread_nodes(torch.ones(40, 3), 5).tolist() == [[1.0, 1.0, 1.0]] * 5
+    assert spread_out(torch.ones(40, 3), 5).tolist() == [[1.0, 1.0, 1.0]] * 5
