@@ -1,8 +1,10 @@
-"""What is timed: drawing forward and backward, and a whole training step."""
+"""What is timed: drawing, following control points, both with gradients, and a whole step."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import itertools
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -12,6 +14,10 @@ from gsdmsr_cli.drawing.splatting import draw
 from gsdmsr_cli.gaussians.moment import Moment
 from gsdmsr_cli.model.building import start_model
 from gsdmsr_cli.model.layer import Facts
+from gsdmsr_cli.model.motion.control_points import Options
+from gsdmsr_cli.ops import skin, spread
+from gsdmsr_cli.ops.displace import OUTPUTS
+from gsdmsr_cli.ops.nearest import Nearest
 from gsdmsr_cli.ops.planes import CUBE
 from gsdmsr_cli.raster import best_engine
 from gsdmsr_cli.training.gradients.compare import compare
@@ -21,6 +27,8 @@ TIME = 0.65
 FRAMES = 200
 SSIM_WEIGHT = 0.2
 NOISE = 0.05
+MOVE, MOVES = 1e-4, 16
+"""By how much splats and control points go along each axis in a step, and after how many again."""
 
 
 def target_of(rgb: Tensor) -> Tensor:
@@ -78,6 +86,42 @@ def training_step(size: int, count: int, motion: str, device: str = "cpu") -> Ca
         wait(device)
 
     return run
+
+
+def following(count: int, device: str = "cpu") -> Callable[[], None]:
+    """Return a function that lets splats follow control points, and takes all gradients.
+
+    That is the search for the nearest, their transforms and skinning. Splats and control points
+    move a little between calls, as they do in training.
+    """
+    rng, options = _generator(), Options()
+    splats = cloud(count).map(lambda t: t.to(device).requires_grad_(True))
+    points = spread.spread_out(splats.means, options.count)
+    made = spread.spacing(points).log(), 0.1 * torch.randn(options.count, OUTPUTS, generator=rng)
+    log_radii, deformation = (t.to(device).requires_grad_(True) for t in made)
+    slopes = [torch.randn(count, width, generator=rng).to(device) for width in (3, 4, 3)]
+    walks = [_walk(splats.means, rng), _walk(points.to(device), rng)]
+    search, moments = Nearest(options.neighbours), itertools.cycle(zip(*walks, strict=True))
+
+    def run() -> None:
+        means, control_points = next(moments)
+        near = search.find(means, control_points)
+        transforms = skin.transforms(control_points, deformation)
+        there = replace(splats, means=means)
+        moved = skin.skin(there, control_points, log_radii, transforms, near)
+        parts = [moved.means, moved.quats, moved.log_scales]
+        torch.autograd.backward(parts, slopes)
+        for tensor in (*there.tensors().values(), control_points, log_radii, deformation):
+            tensor.grad = None
+        wait(device)
+
+    return run
+
+
+def _walk(places: Tensor, generator: torch.Generator) -> Sequence[Tensor]:
+    """Return places (N, 3) after each of so many steps in random directions, with gradients."""
+    steps = MOVE * torch.randn(MOVES, *places.shape, generator=generator).to(places.device)
+    return [place.requires_grad_(True) for place in places.detach() + steps.cumsum(dim=0)]
 
 
 def _generator() -> torch.Generator:

@@ -19,7 +19,7 @@ from gsdmsr_cli.benchmark.timing import in_turns
 from gsdmsr_cli.ground.errors import UsageError
 
 CASES = {
-    "cpu": ((400, 20_000), (800, 50_000)),
+    "cpu": ((400, 20_000), (800, 50_000), (800, 100_000)),
     "cuda": ((800, 50_000), (800, 200_000), (800, 1_000_000)),
 }
 """Sides of pictures and numbers of splats, by device."""
@@ -65,11 +65,13 @@ def _yardstick(folder: Path | None, device: str, console: Console) -> Any:
 
 def _measure(size: int, count: int, device: str, other: Any) -> list[dict[str, Any]]:
     functions: dict[str, Callable[[], object]] = {
-        "draw forward + backward": workloads.drawing(size, count, device)
+        "draw forward + backward": workloads.drawing(size, count, device),
+        "follow control points, forward + backward": workloads.following(count, device),
     }
     for motion in MOTIONS:
         step = workloads.training_step(size, count, motion, device)
         functions[f"training step, {motion}"] = step
+    ours = list(functions)
     if other is not None and device == "cpu":
         functions["yardstick draw"] = yardstick.drawing(other, size, count)
         functions["yardstick step"] = yardstick.training_step(other, size, count)
@@ -77,9 +79,9 @@ def _measure(size: int, count: int, device: str, other: Any) -> list[dict[str, A
         functions["yardstick draw"] = gsplat.drawing(other, size, count, device)
     times = in_turns(functions)
     rows = []
-    for name in list(functions)[: 1 + len(MOTIONS)]:
+    for name in ours:
         row = {"size": size, "splats": count, "what": name, "ms": times[name]}
-        against = "yardstick draw" if name.startswith("draw") else "yardstick step"
+        against = {"draw": "yardstick draw", "training": "yardstick step"}.get(name.split()[0])
         if against in times:
             row |= {"yardstick_ms": times[against], "ratio": times[name] / times[against]}
         rows.append(row)

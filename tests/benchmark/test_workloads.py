@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from typing import Any
 
 import pytest
@@ -65,6 +66,30 @@ def test_a_step_takes_all_gradients_and_moves_nothing(
         assert torch.equal(tensor, before[name]), name
         assert tensor.grad is None
     assert seen[1][2].loss == look.loss
+
+
+def test_following_goes_on_from_where_splats_and_control_points_were(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    true, seen = workloads.skin.skin, []
+
+    def remember(splats: Any, points: Any, *rest: Any) -> Any:
+        moved = true(splats, points, *rest)
+        for tensor in (splats.means, splats.quats, points, *rest[:2]):
+            tensor.register_hook(lambda gradient: lengths.append(float(gradient.norm())))
+        seen.append((splats.means.detach().clone(), points.detach().clone(), rest[2]))
+        return moved
+
+    lengths: list[float] = []
+    monkeypatch.setattr(workloads.skin, "skin", remember)
+    run = workloads.following(2000)
+    for _ in range(workloads.MOVES + 1):
+        run()
+    assert len(lengths) >= 5 * len(seen) and min(lengths) > 0
+    for before, after in itertools.pairwise(seen[: workloads.MOVES]):
+        for one, other in zip(before[:2], after[:2], strict=True):
+            assert 0.5 < float((other - one).std()) / workloads.MOVE < 1.5
+    assert all(map(torch.equal, seen[0], seen[-1]))
 
 
 def test_a_target_has_a_loss_at_nearly_every_pixel() -> None:
