@@ -22,13 +22,14 @@ from gsdmsr_cli.scene.pictures import Pictures
 from gsdmsr_cli.training.gradients.phase import Order, Phase
 from gsdmsr_cli.training.trainer import Trainer
 
-SIDE, VIEWS = 400, 30
+SIDE, VIEWS = 800, 20
 
-WHOLE_MIB, HALVED_MIB = 14.1, 3.8
+WHOLE_MIB, HALVED_MIB = 36.9, 9.4
 """Memory of all pictures and of all their halves, in whole blocks."""
 
-SLACK_MIB = 1.0
-"""For what else grows while all views are looked at; 0.2 to 0.4 was measured."""
+SLACK_MIB = 5.0
+"""For what else grows while all views are looked at: 0.2 to 0.4 in a process of its own, 2.1 after
+the other tests, since pages that processes share are copied when one of them writes there."""
 
 SHARES = Path("/proc/self/smaps_rollup")
 
@@ -86,7 +87,7 @@ def look_at(trainer: Trainer, views: range, phase: Phase) -> None:
 
 
 @pytest.mark.usefixtures("two_threads")
-@pytest.mark.parametrize("limit_mib", [0, 4, 64])
+@pytest.mark.parametrize("limit_mib", [0, 16, 128])
 def test_pictures_of_all_processes_stay_within_the_limit(scene: Path, limit_mib: int) -> None:
     options = "training.views_per_step=2", "training.low_resolution_until=0.5"
     pictures = Pictures((1.0, 1.0, 1.0), 1, limit_mib << 20)
