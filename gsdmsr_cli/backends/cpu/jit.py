@@ -100,6 +100,22 @@ _load_tbb()
 import numba  # noqa: E402  (finds TBB only if that is loaded by now)
 from numba.core.caching import FunctionCache  # noqa: E402
 
+
+def _keep_tbb_loaded() -> None:
+    """Let Numba's part that uses TBB never be unloaded.
+
+    When it is, at the end of a process, it waits for a task that TBB's threads were to run. On a
+    single core there are none, and it may wait forever.
+    """
+    try:
+        from numba.np.ufunc import tbbpool
+    except ImportError:
+        return
+    ctypes.pythonapi.Py_IncRef(ctypes.py_object(tbbpool))
+
+
+_keep_tbb_loaded()
+
 # set in both places: Numba has read its environment already if anybody imported it before, and
 # reads it again when it changes
 numba.config.CACHE_DIR = os.environ.setdefault("NUMBA_CACHE_DIR", str(_cache_folder()))

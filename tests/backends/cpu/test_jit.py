@@ -63,3 +63,23 @@ def test_a_process_compiles_what_no_other_can(tmp_path: Path) -> None:
     unable = "import sys; sys.executable = ''" + IN_A_NEW_PROCESS
     assert compiled_in(tmp_path, unable) == [[0, 1], [0, 1]]
     assert compiled_in(tmp_path) == [[1, 0], [0, 0]]
+
+
+ON_ONE_CORE = """
+import os
+os.sched_setaffinity(0, [min(os.sched_getaffinity(0))])
+import torch
+from gsdmsr_cli.ops.nearest import nearest_points
+
+nearest_points(torch.zeros(9, 3), torch.zeros(5, 3), torch.zeros(9, 2, dtype=torch.int32))
+"""
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="processes cannot be bound here")
+@pytest.mark.parametrize("last", ["", "os._exit(0) if os.fork() == 0 else os.wait()"])
+def test_a_process_on_one_core_ends(last: str) -> None:
+    """TBB has no threads there, and what it waits for at the end may never be done."""
+    code = ON_ONE_CORE + last
+    for _ in "12":
+        done = subprocess.run([sys.executable, "-c", code], check=False, timeout=120)
+        assert done.returncode == 0
