@@ -13,7 +13,6 @@ import hashlib
 import importlib
 import os
 import pickle
-import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -22,6 +21,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+from gsdmsr_cli.backends.cpu.forking import Forks
 from gsdmsr_cli.ground.machine import cache_home
 
 try:
@@ -108,7 +108,7 @@ def _keep_tbb_loaded() -> None:
     single core there are none, and it may wait forever.
     """
     try:
-        from numba.np.ufunc import tbbpool
+        tbbpool = importlib.import_module("numba.np.ufunc.tbbpool")
     except ImportError:
         return
     ctypes.pythonapi.Py_IncRef(ctypes.py_object(tbbpool))
@@ -131,11 +131,13 @@ _OPTIONS: dict[str, Any] = {
     "nogil": True,
 }
 
-_COMPILE = "from gsdmsr_cli.backends.cpu import jit; jit.compile_one()"
-"""What a process that is to compile a kernel is started with."""
+_compilers = Forks(
+    "from gsdmsr_cli.backends.cpu import forking, jit; forking.serve(jit.compile_one)"
+)
+"""Processes that compile a kernel each."""
 
 _compiles_here: set[tuple[str, str]] = set()
-"""Module and name of the kernel that this process was started to compile."""
+"""Module and name of the kernel that this process is there to compile."""
 
 
 class _Cache(FunctionCache):  # type: ignore[misc]
@@ -180,27 +182,20 @@ def _compile_apart(module: str, name: str, signature: Any) -> bool:
         "PYTHONPATH": os.pathsep.join(sys.path),
     }
     try:
-        done = subprocess.run(
-            [sys.executable, "-c", _COMPILE],
-            input=pickle.dumps((module, name, signature)),
-            env=environment,
-            capture_output=True,
-            check=False,
-        )
+        return _compilers.do(pickle.dumps((module, name, signature)), environment)
     except OSError:
         return False
-    return done.returncode == 0
 
 
-def compile_one() -> None:
-    """Compile the kernel that the standard input names; see ``_compile_apart``."""
+def compile_one(asked: bytes) -> None:
+    """Compile a kernel, in a process that does nothing else; see ``_compile_apart``."""
     for folder in (PACKAGE / "ops").iterdir():
         if folder.is_dir():
             # an operation's own module brings torch, which takes longer than most kernels
             empty = ModuleType(f"{PACKAGE.name}.ops.{folder.name}")
             empty.__path__ = [str(folder)]
             sys.modules[empty.__name__] = empty
-    module, name, signature = pickle.load(sys.stdin.buffer)
+    module, name, signature = pickle.loads(asked)
     _compiles_here.add((module, name))
     getattr(importlib.import_module(module), name).compile(signature)
 

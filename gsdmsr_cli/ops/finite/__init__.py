@@ -13,7 +13,7 @@ from gsdmsr_cli.ops.finite import cpu as kernels
 
 
 def all_finite(tensors: Sequence[Tensor]) -> bool:
-    """Tell whether all values of the tensors are finite; waits for a GPU."""
+    """Return whether all values of the tensors are finite; waits for a GPU."""
     if all(t.is_contiguous() for t in tensors) and choose(*tensors) == "cpu":
         places = np.array([(t.data_ptr(), t.numel()) for t in tensors], np.int64).reshape(-1, 2)
         return bool(kernels.all_finite(places))

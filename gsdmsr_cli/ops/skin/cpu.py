@@ -294,7 +294,7 @@ def _follow_backward(rows, near, i, weights, d_t, at, totals, t, pull, sums):
 
 @inline
 def _is_finite(quats, weights, i):
-    """Tell whether a splat's values are; means that are not make all weights NaN."""
+    """Return whether a splat's values are finite; means that are not make all weights NaN."""
     total = quats[i, 0] + quats[i, 1] + quats[i, 2] + quats[i, 3]
     return abs(total + weights[i, 0]) < _INFINITE
 
