@@ -226,6 +226,7 @@ class DensityOptions:
         prune_scale: a splat above this scale is pruned [scene radii].
         prune_opacity: a splat below this opacity is pruned.
         reset_at: progress of each opacity reset.
+        reset_opacity: what opacities are lowered to then.
         cap: most splats there may be.
         thin_at: progress of each thinning, after which the splats that the pictures depend on least
             are gone, see ``training.population.thinning``.
@@ -241,6 +242,7 @@ class DensityOptions:
     prune_scale: float = 0.1
     prune_opacity: float = 0.005
     reset_at: tuple[float, ...] = (0.12,)
+    reset_opacity: float = 0.05
     cap: int = 100000
     thin_at: tuple[float, ...] = ()
     thin_share: float = 0.3
@@ -251,6 +253,7 @@ class DensityOptions:
         _require_progress(self, "until")
         _require_positive(self, "gradient", "split_scale", "prune_scale")
         require(self, "prune_opacity", 0.0 <= self.prune_opacity < 1.0, "0 or more, below 1")
+        require(self, "reset_opacity", 0.0 < self.reset_opacity < 1.0, "above 0, below 1")
         require(self, "thin_share", 0.0 <= self.thin_share < 1.0, "0 or more, below 1")
         for key in ("reset_at", "thin_at"):
             ok = all(0.0 <= progress <= 1.0 for progress in getattr(self, key))

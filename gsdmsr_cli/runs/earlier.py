@@ -1,4 +1,4 @@
-"""Brings checkpoints that earlier versions wrote to the form that this version writes."""
+"""Brings runs that earlier versions wrote to the form that this version writes."""
 
 from __future__ import annotations
 
@@ -9,6 +9,15 @@ from torch import Tensor
 
 _RENAMED = {"control_points": {"motion.nodes": "motion.control_points"}}
 """By motion: parameters that schema 1 called otherwise."""
+
+_ADDED = {"density": {"reset_opacity": 0.01}}
+"""Options that schema 1 did not have, and what was done in their place."""
+
+
+def present_options(options: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the options of a run of schema 1 with those that schema 2 has besides."""
+    added = {topic: more | options[topic] for topic, more in _ADDED.items()}
+    return {**options, **added}
 
 
 def present_tensors(tensors: Mapping[str, Tensor], motion: str) -> dict[str, Tensor]:

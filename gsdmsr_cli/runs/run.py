@@ -294,10 +294,13 @@ def open_run(root: Path) -> Run:
         known = " and ".join(map(str, _READ))
         raise DataError(f"{path}: has schema {about.get('schema')}; this version reads {known}")
     try:
+        options: Mapping[str, Any] = with_present_names(about["preset"])
+        if about["schema"] < SCHEMA:
+            options = earlier.present_options(options)
         return Run(
             root,
             str(about["name"]),
-            strict.build(Preset, with_present_names(about["preset"]), "preset"),
+            strict.build(Preset, options, "preset"),
             strict.build(Facts, about["facts"], "facts"),
             Path(about["data"]["path"]),
             str(about["data"]["layout"]),

@@ -342,6 +342,7 @@ def as_before_version_0_2(run: Run) -> None:
     """Rewrite a run's description and checkpoint as schema 1 had them."""
     about = json.loads((run.root / "run.json").read_text())
     about["schema"], about["preset"]["motion"]["name"] = 1, "nodes"
+    assert about["preset"]["density"].pop("reset_opacity") == 0.01
     (run.root / "run.json").write_text(json.dumps(about))
     with safe_open(run.checkpoint_path, "pt") as file:
         header = json.loads(file.metadata()["gsdmsr"])
@@ -355,7 +356,8 @@ def as_before_version_0_2(run: Run) -> None:
 def test_a_run_of_schema_1_is_converted_when_it_is_read(
     tmp_path: Path, scene: Scene, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    preset, splats = load_preset("dnerf", None, ["motion.count=16"]), splats_of(9)
+    options = ["motion.count=16", "density.reset_opacity=0.01"]
+    preset, splats = load_preset("dnerf", None, options), splats_of(9)
     run = create_run(tmp_path / "run", "dnerf", preset, FACTS, scene)
     model = start_model(splats, preset.motion, (), FACTS, torch.Generator().manual_seed(0))
     points = "motion.control_points"

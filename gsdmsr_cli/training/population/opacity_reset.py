@@ -15,12 +15,10 @@ from gsdmsr_cli.options.preset import Preset
 from gsdmsr_cli.training.population import Event, Tick
 from gsdmsr_cli.training.resizing import Population
 
-RESET_OPACITY = 0.01
-
 
 @dataclass(frozen=True)
 class Options:
-    """None of its own: see ``DensityOptions.reset_at``."""
+    """None of its own: see ``DensityOptions.reset_at`` and ``reset_opacity``."""
 
 
 class OpacityReset(Event):
@@ -30,8 +28,9 @@ class OpacityReset(Event):
         count: how many times it has happened.
     """
 
-    def __init__(self, reset_at: tuple[float, ...]) -> None:
-        self.reset_at = reset_at
+    def __init__(self, reset_at: tuple[float, ...], opacity: float) -> None:
+        """Lower opacities to ``opacity`` each time."""
+        self.reset_at, self.opacity = reset_at, opacity
         self.count = 0
 
     def due(self, tick: Tick) -> bool:
@@ -41,7 +40,7 @@ class OpacityReset(Event):
     def apply(self, population: Population, tick: Tick) -> None:
         """Lower the opacities; their moments, and averages, no longer hold."""
         self.count += 1
-        reset_opacities(population.model.splats)
+        reset_opacities(population.model.splats, self.opacity)
         population.optimizer.reset_moments(STORED_AS + "logit_opacities")
         population.average.clear()
         population.saliency.restart(torch.ones_like(population.saliency.high))
@@ -57,10 +56,10 @@ class OpacityReset(Event):
 
 def start(options: Options, preset: Preset) -> OpacityReset:
     """Return resets as the preset wants them."""
-    return OpacityReset(preset.density.reset_at)
+    return OpacityReset(preset.density.reset_at, preset.density.reset_opacity)
 
 
 @torch.no_grad()
-def reset_opacities(splats: Splats) -> None:
-    """Lower every opacity to 0.01 at most, in place, so that useless splats can be pruned."""
-    splats.logit_opacities.clamp_(max=math.log(RESET_OPACITY / (1 - RESET_OPACITY)))
+def reset_opacities(splats: Splats, opacity: float) -> None:
+    """Lower every opacity to this one at most, in place, so that useless splats can be pruned."""
+    splats.logit_opacities.clamp_(max=math.log(opacity / (1 - opacity)))
