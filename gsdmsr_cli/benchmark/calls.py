@@ -29,7 +29,7 @@ def call(*line: str) -> None:
         GsdmsrError: it has failed; its own message stands above.
         KeyboardInterrupt: Ctrl-C has ended it.
     """
-    process = _start(line, sys.stderr.fileno())
+    process = start(line, sys.stderr.fileno())
     interrupted = False
     while True:
         try:
@@ -104,10 +104,10 @@ def call_side_by_side(works: Mapping[Path, Iterator[Line]], threads: int) -> Non
 def _start_logged(line: Line, log: Path, threads: int) -> subprocess.Popen[bytes]:
     log.parent.mkdir(parents=True, exist_ok=True)
     with log.open("ab") as shown:
-        return _start(line, shown.fileno(), threads)
+        return start(line, shown.fileno(), threads)
 
 
-def _start(line: Line, shown: int, threads: int = 0) -> subprocess.Popen[bytes]:
+def start(line: Line, shown: int, threads: int = 0) -> subprocess.Popen[bytes]:
     """Start a command that writes all it shows to the file descriptor ``shown``."""
     command = [sys.executable, "-m", "gsdmsr_cli", *line]
     limit = {"NUMBA_NUM_THREADS": str(threads), "OMP_NUM_THREADS": str(threads)} if threads else {}

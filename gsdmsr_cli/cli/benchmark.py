@@ -18,6 +18,7 @@ def register(app: typer.Typer) -> None:
     group.command()(scenes)
     group.command()(resume)
     group.command()(still)
+    group.command()(soak)
     app.add_typer(group, name="benchmark")
 
 
@@ -117,3 +118,18 @@ def still(
     from gsdmsr_cli.commands import benchmark_still as command
 
     command.run(run, below or [0.1, 0.3, 1.0, 3.0], split, data, as_json)
+
+
+def soak(
+    command: Annotated[
+        list[str], typer.Argument(metavar="-- COMMAND...", help="What to run, without gsdmsr.")
+    ],
+    every: Annotated[
+        float, typer.Option(min=0.1, metavar="S", help="Seconds between two samples.")
+    ] = 10.0,
+    as_json: Json = False,
+) -> None:
+    """Run a long command and tell whether its memory and open files grow."""
+    from gsdmsr_cli.commands import benchmark_soak
+
+    benchmark_soak.run(command, every, as_json)

@@ -56,13 +56,13 @@ def test_one_that_fails_ends_its_own_work_alone(tmp_path: Path) -> None:
 def test_an_error_between_commands_leaves_none_behind(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    true, started = calls._start, []
+    true, started = calls.start, []
 
     def remember(*given: Any) -> subprocess.Popen[bytes]:
         started.append(true(*given))
         return started[-1]
 
-    monkeypatch.setattr(calls, "_start", remember)
+    monkeypatch.setattr(calls, "start", remember)
 
     def broken() -> Iterator[Line]:
         yield ["--version"]

@@ -1,0 +1,120 @@
+"""Watches what a long command holds: memory, shared memory, open files and processes."""
+
+from __future__ import annotations
+
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import astuple, dataclass
+from pathlib import Path
+from statistics import median
+
+import numpy as np
+
+from gsdmsr_cli.benchmark.calls import start
+from gsdmsr_cli.ground.errors import GsdmsrError
+
+PROC = Path("/proc")
+"""Where Linux tells of processes."""
+
+
+@dataclass(frozen=True)
+class Sample:
+    """What a command and all processes that it has started hold at a moment.
+
+    Attributes:
+        elapsed_s: since its start [s].
+        memory_mib: resident memory of their own; what several share counts once [MiB].
+        shared_mib: resident memory that is meant to be shared, as that of workers [MiB].
+        files: open files, pipes and sockets.
+        processes: how many there are.
+    """
+
+    elapsed_s: float
+    memory_mib: float
+    shared_mib: float
+    files: float
+    processes: float
+
+
+def watch(command: Sequence[str], every_s: float) -> list[Sample]:
+    """Run ``gsdmsr`` with these arguments to its end and return a sample of every ``every_s``.
+
+    Its output goes to stderr.
+
+    Raises:
+        GsdmsrError: this system does not tell of processes, or the command has failed.
+    """
+    if not (PROC / "self" / "smaps_rollup").exists():
+        raise GsdmsrError(f"{PROC}/self/smaps_rollup is not there; memory is counted on Linux only")
+    samples, began = list[Sample](), time.perf_counter()
+    with start(command, sys.stderr.fileno()) as process:
+        try:
+            while _runs(process, every_s):
+                samples.append(take_sample(process.pid, time.perf_counter() - began))
+        except BaseException:
+            process.send_signal(signal.SIGINT)
+            raise
+    if process.returncode:
+        raise GsdmsrError(f"gsdmsr {command[0]} has failed with exit code {process.returncode}")
+    return samples
+
+
+def _runs(process: subprocess.Popen[bytes], seconds: float) -> bool:
+    with suppress(subprocess.TimeoutExpired):
+        process.wait(seconds)
+    return process.returncode is None
+
+
+def take_sample(root: int, elapsed_s: float) -> Sample:
+    """Return what process ``root`` and its descendants hold now; one that ends counts as nothing.
+
+    Memory is the proportional set size of /proc/PID/smaps_rollup: a page that n processes share
+    counts 1 / n in each.
+    """
+    memory = shared = files = 0.0
+    family = _family(root)
+    for pid in family:
+        with suppress(OSError):
+            sizes = (PROC / str(pid) / "smaps_rollup").read_text(encoding="ascii")
+            memory += _mib(sizes, "Pss_Anon") + _mib(sizes, "Pss_File")
+            shared += _mib(sizes, "Pss_Shmem")
+            files += sum(1 for _ in (PROC / str(pid) / "fd").iterdir())
+    return Sample(elapsed_s, memory, shared, files, len(family))
+
+
+def _family(root: int) -> list[int]:
+    found = [root]
+    for pid in found:  # grows while it is gone through
+        with suppress(OSError):
+            for children in (PROC / str(pid) / "task").glob("*/children"):
+                found += map(int, children.read_text(encoding="ascii").split())
+    return found
+
+
+def _mib(sizes: str, name: str) -> float:
+    found = re.search(rf"^{name}:\s+(\d+) kB$", sizes, re.MULTILINE)
+    return int(found[1]) / 1024 if found else 0.0
+
+
+def tenths(samples: Sequence[Sample]) -> list[Sample]:
+    """Return the median of each tenth of the samples, in order; fewer where there are fewer."""
+    parts = np.array_split(np.array([astuple(sample) for sample in samples]), 10)
+    return [Sample(*(median(column) for column in part.T)) for part in parts if len(part)]
+
+
+def growth(samples: Sequence[Sample]) -> Sample:
+    """Return by how much each quantity grows in an hour in the second half of the samples.
+
+    The first half has other work: kernels are loaded, pictures kept, splats become more. It is the
+    slope of the line of least squares; ``elapsed_s`` is 3600.
+    """
+    later = np.array([astuple(sample) for sample in samples[len(samples) // 2 :]])
+    if len(later) < 2:
+        raise GsdmsrError("the command has ended before two samples; lower --every")
+    hours = later[:, 0] / 3600
+    return Sample(3600.0, *(float(np.polyfit(hours, column, 1)[0]) for column in later.T[1:]))
