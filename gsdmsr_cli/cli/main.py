@@ -15,7 +15,6 @@ from typing import Annotated, cast
 
 import typer
 
-from gsdmsr_cli import __version__
 from gsdmsr_cli.cli import (
     benchmark,
     demo,
@@ -27,6 +26,7 @@ from gsdmsr_cli.cli import (
     weights,
 )
 from gsdmsr_cli.cli import eval as evaluate
+from gsdmsr_cli.ground import origin
 from gsdmsr_cli.ground.errors import GsdmsrError, UsageError
 
 # These files import gsdmsr_cli.commands in the functions that run them: torch alone would make
@@ -63,7 +63,7 @@ _MACHINE_ERRNOS = frozenset(
 
 def _version(value: bool) -> None:
     if value:
-        typer.echo(f"gsdmsr {__version__}")
+        typer.echo(f"gsdmsr {origin.version()}")
         raise typer.Exit
 
 

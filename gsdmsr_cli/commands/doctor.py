@@ -18,7 +18,7 @@ from gsdmsr_cli.evaluation.lpips import NETS, load_lpips
 from gsdmsr_cli.evaluation.metrics import Missing
 from gsdmsr_cli.filming.encode import require_encoder
 from gsdmsr_cli.filming.request import VIDEOS
-from gsdmsr_cli.ground import plugins
+from gsdmsr_cli.ground import origin, plugins
 from gsdmsr_cli.ground.errors import GsdmsrError
 from gsdmsr_cli.ground.machine import cores
 from gsdmsr_cli.options import preset_files
@@ -55,6 +55,7 @@ def examine() -> dict[str, Any]:
     """Return the report, fit for JSON; what is unavailable has a reason, what works has null."""
     return {
         "gsdmsr": __version__,
+        "commit": origin.commit(),
         "python": platform.python_version(),
         "platform": f"{platform.system()} {platform.release()} {platform.machine()}",
         "cpu": {"name": llvm.get_host_cpu_name(), "cores": cores(), "simd": _simd()},
@@ -108,7 +109,7 @@ def _video(kind: str) -> str | None:
 
 
 def _table(report: dict[str, Any]) -> Table:
-    table = Table("what", "found", title=f"gsdmsr {report['gsdmsr']}")
+    table = Table("what", "found", title=f"gsdmsr {origin.version()}")
     cpu = report["cpu"]
     table.add_row("python", f"{report['python']} on {report['platform']}")
     table.add_row(

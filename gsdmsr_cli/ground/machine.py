@@ -9,6 +9,7 @@ from importlib import metadata
 from pathlib import Path
 
 from gsdmsr_cli import __version__
+from gsdmsr_cli.ground.origin import commit
 
 _PACKAGES = ("torch", "numba", "numpy")
 
@@ -52,6 +53,7 @@ def peak_rss_mib(workers: int = 0) -> float | None:
 
 
 def versions() -> dict[str, str]:
-    """Return the versions of gsdmsr, of Python and of the packages that numbers depend on."""
+    """Return the version and commit of gsdmsr, and Python's and those of what numbers depend on."""
+    own = {"gsdmsr": __version__, "commit": commit() or "unknown"}
     packages = {name: metadata.version(name) for name in _PACKAGES}
-    return {"gsdmsr": __version__, "python": platform.python_version(), **packages}
+    return {**own, "python": platform.python_version(), **packages}

@@ -12,8 +12,8 @@ import pytest
 import torch
 import typer
 
-from gsdmsr_cli import __version__
 from gsdmsr_cli.ground.errors import DataError, GsdmsrError, ThresholdError, UsageError
+from gsdmsr_cli.ground.origin import version
 
 Gsdmsr = Any  # the fixture of conftest.py
 
@@ -26,7 +26,7 @@ def python(*arguments: str) -> subprocess.CompletedProcess[str]:
 
 def test_the_package_runs_as_a_module() -> None:
     done = python("-m", "gsdmsr_cli", "--version")
-    assert (done.returncode, done.stdout, done.stderr) == (0, f"gsdmsr {__version__}\n", "")
+    assert (done.returncode, done.stdout, done.stderr) == (0, f"gsdmsr {version()}\n", "")
     assert python("-m", "gsdmsr_cli", "trian").returncode == 2
 
 
@@ -51,7 +51,7 @@ def test_the_command_line_imports_nothing_heavy() -> None:
 
 def test_version(gsdmsr: Gsdmsr, capsys: pytest.CaptureFixture[str]) -> None:
     assert gsdmsr("--version") == 0
-    assert capsys.readouterr().out == f"gsdmsr {__version__}\n"
+    assert capsys.readouterr().out == f"gsdmsr {version()}\n"
 
 
 @pytest.mark.parametrize(
