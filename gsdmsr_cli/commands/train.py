@@ -21,7 +21,8 @@ from gsdmsr_cli.commands._training_display import TrainingDisplay
 from gsdmsr_cli.formats import read_scene
 from gsdmsr_cli.ground import machine
 from gsdmsr_cli.ground.errors import UsageError
-from gsdmsr_cli.ground.files import sole_writer, write_json
+from gsdmsr_cli.ground.files import write_json
+from gsdmsr_cli.ground.locks import sole_writer
 from gsdmsr_cli.options import strict
 from gsdmsr_cli.options.preset import BACKGROUNDS, Preset, load_preset
 from gsdmsr_cli.runs.run import (

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import sys
 import uuid
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
@@ -13,13 +12,7 @@ from typing import Any
 
 from gsdmsr_cli.ground.errors import DataError
 
-if sys.platform != "win32":
-    import fcntl
-
 _PART = ".part"
-
-_held = set[int]()
-"""Descriptors of the folders that this process is the sole writer of."""
 
 
 @contextmanager
@@ -82,54 +75,6 @@ def require_folder(path: Path) -> None:
         raise DataError(f"{path}: cannot be made: {error.strerror or error}") from error
     if not os.access(path, os.W_OK | os.X_OK):
         raise DataError(f"{path}: cannot be written; choose another folder or change its rights")
-
-
-@contextmanager
-def sole_writer(folder: Path) -> Iterator[None]:
-    """Keep other processes that ask for the same from the folder ``folder``, which is made.
-
-    The end of this process, however it comes, lets go of it; what it forks does not hold it. Where
-    folders cannot be locked, on Windows and on some network drives, nobody is kept out.
-
-    Raises:
-        DataError: another process is the folder's writer, or it cannot be made.
-    """
-    require_folder(folder)
-    descriptor = _lock(folder)
-    try:
-        yield
-    finally:
-        if descriptor in _held:
-            _held.remove(descriptor)
-            os.close(descriptor)
-
-
-def _lock(folder: Path) -> int:
-    """Return the descriptor that holds the folder, or -1 where folders cannot be locked."""
-    if sys.platform == "win32":
-        return -1
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        os.close(descriptor)
-        raise DataError(
-            f"{folder}: another process is writing there; wait for its end or choose another --out"
-        ) from None
-    except OSError:
-        os.close(descriptor)
-        return -1
-    _held.add(descriptor)
-    return descriptor
-
-
-def _let_go() -> None:
-    while _held:
-        os.close(_held.pop())
-
-
-if sys.platform != "win32":
-    os.register_at_fork(after_in_child=_let_go)  # or forks would keep the lock after a kill
 
 
 def read_json(path: Path) -> dict[str, Any]:

@@ -21,7 +21,7 @@ from gsdmsr_cli.commands import train as train_command
 from gsdmsr_cli.commands._trained import open_trained
 from gsdmsr_cli.drawing.splatting import draw
 from gsdmsr_cli.formats import read_scene
-from gsdmsr_cli.ground import files
+from gsdmsr_cli.ground import files, locks
 from gsdmsr_cli.ground.errors import DataError, UsageError
 from gsdmsr_cli.options.preset import load_preset
 from gsdmsr_cli.raster import best_engine
@@ -202,7 +202,7 @@ def test_a_folder_in_which_another_training_writes_is_left_alone(
 ) -> None:
     before = run.checkpoint_path.read_bytes()
     for how in ("--resume", "--overwrite"):
-        with files.sole_writer(run.root):
+        with locks.sole_writer(run.root):
             assert gsdmsr("train", "--data", tiny_scene, "--out", run.root, how) == 3
         assert "another process is writing there" in one_line(capsys)
     assert run.checkpoint_path.read_bytes() == before
@@ -220,7 +220,7 @@ def test_a_training_holds_its_folder_from_the_first_look_to_the_last_word(
 
         def asking(*given: Any) -> Any:
             asked.append(moment)
-            with pytest.raises(DataError, match="another process"), files.sole_writer(run.root):
+            with pytest.raises(DataError, match="another process"), locks.sole_writer(run.root):
                 pass
             return real(*given)
 
@@ -233,7 +233,7 @@ def test_a_training_holds_its_folder_from_the_first_look_to_the_last_word(
     options = [*few, "--steps", 1, "--set", "training.threads=1", how]
     assert gsdmsr("train", "--data", tiny_scene, "--out", run.root, *options) == 0
     assert asked == [first, "read_scene", "write_json"]
-    with files.sole_writer(run.root):
+    with locks.sole_writer(run.root):
         assert run.training_path.is_file()
 
 
