@@ -16,6 +16,7 @@ from rich.console import Console
 from gsdmsr_cli import raster
 from gsdmsr_cli.backends.cpu.jit import set_threads, threads
 from gsdmsr_cli.backends.cuda import availability
+from gsdmsr_cli.commands._choice import Choice, Chosen
 from gsdmsr_cli.commands._progress import progress_bar
 from gsdmsr_cli.commands._training_display import TrainingDisplay
 from gsdmsr_cli.formats import read_scene
@@ -38,7 +39,7 @@ from gsdmsr_cli.scene.pictures import Pictures
 from gsdmsr_cli.scene.scene import Scene
 from gsdmsr_cli.training.loop import train
 from gsdmsr_cli.training.schedule import new_clock
-from gsdmsr_cli.training.trainer import Trainer, check_plugins
+from gsdmsr_cli.training.trainer import Trainer
 from gsdmsr_cli.training.warm_up import warm_up, warm_up_motion
 
 MAY_CHANGE = (
@@ -65,14 +66,14 @@ def run(
         DataError: the data or the run folder cannot be used.
         KeyboardInterrupt: Ctrl-C ended the training; ``out`` holds a checkpoint to go on from.
     """
+    choice = Choice(preset, config, overrides)
     with ExitStack() as locks:  # the run folder, from before it is read until all is written there
         there = out.is_dir()
         if there:
             locks.enter_context(sole_writer(out))
         earlier = open_run(out) if resume else None
         if earlier is None:
-            options = load_preset(preset, config, overrides)
-            check_plugins(options)  # an error now rather than after the data has been read
+            options = choice.check()  # an error now rather than after the data has been read
             refuse_used(out, overwrite)
         else:
             options = _resumed_options(earlier, preset, config, overrides)
@@ -83,14 +84,18 @@ def run(
         scene, load_s = _timed(lambda: _read(data))
         if earlier is not None:
             earlier.check_scene(scene)
+        else:
+            chosen = choice.suit(scene)
+            options = chosen.options
+            _say_preset(chosen)
         trainer, prepare_s = _timed(lambda: _prepare(scene, options, where))
         timings = {"load_s": load_s + prepare_s}
         with trainer:
             if not there:
                 locks.enter_context(sole_writer(out))  # made now: bad data leaves no empty folder
             if earlier is None:
-                name = preset or (config.name if config else "default")
-                folder = create_run(out, name, options, trainer.facts, scene, overwrite)
+                about = chosen.name, options, trainer.facts, scene
+                folder = create_run(out, *about, overwrite, chosen.reason)
                 folder.save(trainer.checkpoint())  # a full disk is an error now, not at the end
             else:
                 trainer.restore(checkpoint)
@@ -104,6 +109,12 @@ def run(
     _say_end(folder, trainer, data, finished)
     if not finished:
         raise KeyboardInterrupt
+
+
+def _say_preset(chosen: Chosen) -> None:
+    if chosen.reason is not None:
+        text = f"{chosen.reason}; --preset names another"
+        Console(stderr=True).out(text, highlight=False)
 
 
 def _require_precision(options: Preset, wanted: str, device: str) -> None:

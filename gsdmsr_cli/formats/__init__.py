@@ -5,10 +5,13 @@ from __future__ import annotations
 from itertools import islice
 from pathlib import Path
 
+from gsdmsr_cli.formats._suited import Suited, suited_preset
 from gsdmsr_cli.ground import plugins
 from gsdmsr_cli.ground.errors import DataError
 from gsdmsr_cli.ground.progress import OnProgress
 from gsdmsr_cli.scene.scene import Scene
+
+__all__ = ["Suited", "read_scene", "recognised", "suited_preset"]
 
 
 def read_scene(folder: Path, on_progress: OnProgress = lambda done, total: None) -> Scene:
@@ -17,7 +20,8 @@ def read_scene(folder: Path, on_progress: OnProgress = lambda done, total: None)
     A format is a module of this package with ``SIGN: str``, the files that it is recognised by, for
     messages; ``matches(folder: Path) -> bool``; and ``read(folder: Path) -> Scene``, which raises
     DataError. It may have ``prepare(folder: Path, on_progress: OnProgress)``, which does what is
-    needed only once, such as decoding videos.
+    needed only once, such as decoding videos; and ``PRESET``, the preset for its scenes where none
+    is named, if that does not follow from their cameras.
 
     Args:
         folder: of the capture.

@@ -16,6 +16,8 @@ from gsdmsr_cli.scene.scene import SPLITS, Scene, View
 
 SIGN = "transforms_train.json"
 
+PRESET = "dnerf"
+
 BOUND = 1.3
 """Half edge of the box in which D-NeRF's objects stand (METHODS 0.8) [world units]."""
 

@@ -21,6 +21,8 @@ from gsdmsr_cli.scene.scene import Scene, View
 
 SIGN = "dataset.json and camera/"
 
+PRESET = "nerfies"
+
 SCALES = ("2x", "1x", "4x", "8x")
 """Folders of pictures below ``rgb``, the first that is there; papers measure on 2x."""
 

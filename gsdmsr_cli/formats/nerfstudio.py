@@ -56,7 +56,7 @@ def read(folder: Path) -> Scene:
     names = checks.unique_names(view.name for view in views)
     views = [replace(view, name=name) for view, name in zip(views, names, strict=True)]
     points, colours = _read_points(folder, document, path)
-    bound, duration = _declared(folder / DECLARED_BY)
+    bound, duration, origin = _declared(folder / DECLARED_BY)
     world = _world.normalize(views, points) if bound is None else _world.as_it_is(bound)
     return Scene(
         root=folder,
@@ -67,6 +67,7 @@ def read(folder: Path) -> Scene:
         duration=duration,
         bound=world.bound,
         fingerprint=checks.fingerprint([path]),
+        origin=origin,
     )
 
 
@@ -123,15 +124,17 @@ def _read_points(folder: Path, document: dict[str, Any], path: Path) -> _points.
     return _points.read_ply(checks.inner_path(folder, name, f"{path}: ply_file_path"))
 
 
-def _declared(path: Path) -> tuple[float | None, float | None]:
-    """Return the bound of a world that ``gsdmsr prepare`` has normalised, and its duration [s]."""
+def _declared(path: Path) -> tuple[float | None, float | None, str | None]:
+    """Return bound, duration [s] and origin of a scene that ``gsdmsr prepare`` has normalised."""
     if not path.is_file():
-        return None, None
+        return None, None, None
     document = checks.read_json(path)
     if "gsdmsr" not in document:
-        return None, None
-    duration = document.get("duration")
+        return None, None, None
+    duration, given = document.get("duration"), document.get("input")
+    origin = given.get("kind") if isinstance(given, dict) else None
     return (
         checks.positive(document.get("bound"), f"{path}: bound"),
         None if duration is None else checks.number(duration, f"{path}: duration"),
+        origin if isinstance(origin, str) else None,
     )

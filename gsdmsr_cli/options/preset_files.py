@@ -56,14 +56,28 @@ def resolve(name: str | None, config: Path | None, overrides: Sequence[str]) -> 
             YAML; an override has no '='; ``name`` contradicts the config's ``base:``.
     """
     own = read(config) if config else Located()
+    preset = _named(name, own) or "default"
+    given = [own.without("base"), read_overrides(overrides)]
+    asked = [with_present_names(mapping, _hint) for mapping in given]
+    return functools.reduce(_merge, [*_chain(preset), *asked])
+
+
+def named_preset(name: str | None, config: Path | None) -> str | None:
+    """Return ``name``, else the ``base:`` of ``config``, else None.
+
+    Raises:
+        UsageError: the file cannot be read or is not YAML; ``name`` contradicts its ``base:``.
+    """
+    return _named(name, read(config) if config else Located())
+
+
+def _named(name: str | None, own: Located) -> str | None:
     base = _base(own)
     if name and base and name != base:
         raise UsageError(
             f"{own.places['base']}: base '{base}' contradicts --preset {name}; drop one"
         )
-    given = [own.without("base"), read_overrides(overrides)]
-    asked = [with_present_names(mapping, _hint) for mapping in given]
-    return functools.reduce(_merge, [*_chain(name or base or "default"), *asked])
+    return name or base
 
 
 @functools.cache  # a command may read its options several times, and says this once

@@ -76,6 +76,7 @@ class Run:
         data: folder of the scene, absolute when the run was made.
         layout: format of the scene.
         fingerprint: of the scene's layout files.
+        reason: which preset the data has called for, and why; None where it was named.
     """
 
     root: Path
@@ -85,6 +86,7 @@ class Run:
     data: Path
     layout: str
     fingerprint: str
+    reason: str | None = None
 
     @property
     def log_path(self) -> Path:
@@ -108,6 +110,7 @@ class Run:
             "gsdmsr": __version__,
             "torch": torch.__version__,
             "name": self.name,
+            "reason": self.reason,
             "preset": strict.dump(self.preset),
             "facts": asdict(self.facts),
             "data": {
@@ -247,9 +250,17 @@ def refuse_used(root: Path, overwrite: bool) -> None:
 
 
 def create_run(
-    root: Path, name: str, preset: Preset, facts: Facts, scene: Scene, overwrite: bool = False
+    root: Path,
+    name: str,
+    preset: Preset,
+    facts: Facts,
+    scene: Scene,
+    overwrite: bool = False,
+    reason: str | None = None,
 ) -> Run:
     """Start a run folder; an earlier run there is deleted if ``overwrite`` says so.
+
+    ``reason`` is which preset the data has called for, and why.
 
     Raises:
         DataError: the folder is in use and ``overwrite`` is not set, or is not a run at all, or
@@ -261,7 +272,7 @@ def create_run(
         raise DataError(f"{root}: holds the data {scene.root}; choose another --out")
     if root.exists():
         _clear(root)
-    run = Run(root, name, preset, facts, data, scene.layout, scene.fingerprint)
+    run = Run(root, name, preset, facts, data, scene.layout, scene.fingerprint, reason)
     run.describe()
     return run
 
@@ -305,6 +316,7 @@ def open_run(root: Path) -> Run:
             Path(about["data"]["path"]),
             str(about["data"]["layout"]),
             str(about["data"]["fingerprint"]),
+            about.get("reason"),
         )
     except (UsageError, LookupError, TypeError, AttributeError) as error:
         raise DataError(f"{path}: damaged: {error}") from error

@@ -58,6 +58,8 @@ class Scene:
         bound: half edge of the box around the world's origin that holds what is to be
             reconstructed [world units], from the format's convention or the points.
         fingerprint: hash of the layout files, to tell two data sets apart.
+        origin: what ``gsdmsr prepare`` made it from, such as the name of another layout; None where
+            it is as it was published.
     """
 
     root: Path
@@ -68,6 +70,7 @@ class Scene:
     duration: float | None
     bound: float
     fingerprint: str
+    origin: str | None = None
 
     def split(self, name: str) -> tuple[View, ...]:
         """Return the views of one split.

@@ -1,0 +1,132 @@
+"""A training whose preset is not named takes the one that suits its data, and says so."""
+
+from __future__ import annotations
+
+import json
+import shlex
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import numba
+import pytest
+import torch
+from datasets import write_dnerf
+
+from gsdmsr_cli.cli.main import main
+from gsdmsr_cli.commands._choice import Choice
+from gsdmsr_cli.formats import read_scene
+from gsdmsr_cli.ground.errors import UsageError
+from gsdmsr_cli.options.preset import load_preset
+from gsdmsr_cli.runs.run import open_run
+from gsdmsr_cli.scene.scene import Scene
+
+STEPS = ["training.steps=2"]
+
+
+@pytest.fixture(autouse=True)
+def threads_as_before() -> Iterator[None]:
+    """Training says how many threads numba and torch use."""
+    before = numba.get_num_threads(), torch.get_num_threads()
+    yield
+    numba.set_num_threads(before[0])
+    torch.set_num_threads(before[1])
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> Scene:
+    return read_scene(write_dnerf(tmp_path / "scene"))
+
+
+def config(folder: Path, text: str) -> Path:
+    path = folder / "mine.yaml"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def test_a_preset_that_is_not_named_follows_from_the_data(scene: Scene) -> None:
+    choice = Choice(None, None, STEPS)
+    assert not choice.named
+    chosen = choice.suit(scene)
+    assert chosen.options == load_preset("dnerf", None, STEPS)
+    assert chosen.name == "dnerf"
+    assert chosen.reason == "preset dnerf, since the data has the layout dnerf"
+
+
+def test_a_file_without_a_base_stands_over_what_the_data_calls_for(
+    scene: Scene, tmp_path: Path
+) -> None:
+    path = config(tmp_path, "density: {cap: 777}")
+    chosen = Choice(None, path, STEPS).suit(scene)
+    assert chosen.options == load_preset("dnerf", path, STEPS)
+    assert chosen.options.density.cap == 777 and chosen.options.density.rounds == 24
+    assert chosen.name == "mine.yaml" and chosen.reason is not None
+
+
+@pytest.mark.parametrize(
+    ("preset", "text", "name"),
+    [("video", None, "video"), (None, "base: video", "mine.yaml"), ("video", "{}", "video")],
+)
+def test_a_preset_that_is_named_is_taken(
+    scene: Scene, tmp_path: Path, preset: str | None, text: str | None, name: str
+) -> None:
+    choice = Choice(preset, None if text is None else config(tmp_path, text), STEPS)
+    chosen = choice.suit(scene)
+    assert choice.named and chosen.options == choice.check() == load_preset("video", None, STEPS)
+    assert (chosen.name, chosen.reason) == (name, None)
+
+
+@pytest.mark.parametrize(
+    ("override", "where"),
+    [("density.cup=4", "cup"), ("density.cap=many", "density.cap"), ("motion.neighbors=4", None)],
+)
+def test_mistakes_are_told_before_the_data_is_read_where_they_can_be(
+    scene: Scene, override: str, where: str | None
+) -> None:
+    choice = Choice(None, None, [override])
+    if where is not None:
+        with pytest.raises(UsageError, match=where):
+            choice.check()
+    with pytest.raises(UsageError, match=where or r"neighbors.*neighbours"):
+        choice.suit(scene)
+
+
+def gsdmsr(line: str, monkeypatch: pytest.MonkeyPatch) -> int:
+    monkeypatch.setattr(sys, "argv", shlex.split(line))
+    with pytest.raises(SystemExit) as ended:
+        main()
+    assert isinstance(ended.value.code, int)
+    return ended.value.code
+
+
+def test_a_training_says_which_preset_and_why_and_goes_on_with_it(
+    tiny_scene: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    run, said = tmp_path / "run", "preset dnerf, since the data has the layout dnerf"
+    line = f"gsdmsr train --data {tiny_scene} --out {run} --set splats.count=50"
+    assert gsdmsr(f"{line} --steps 2", monkeypatch) == 0
+    assert capsys.readouterr().err.splitlines()[0] == f"{said}; --preset names another"
+    about = json.loads((run / "run.json").read_text())
+    assert (about["name"], about["reason"]) == ("dnerf", said)
+    assert about["preset"]["motion"]["name"] == "control_points"
+    assert gsdmsr(f"{line} --steps 3 --resume", monkeypatch) == 0
+    assert said not in capsys.readouterr().err
+    assert open_run(run).load().step == 3 and open_run(run).reason == said
+
+
+def test_what_prepare_says_comes_next_can_be_pasted(
+    tiny_scene: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert gsdmsr(f"gsdmsr prepare {tiny_scene} --out 'a scene; (1)'", monkeypatch) == 0
+    following = capsys.readouterr().out.splitlines()[-1].removeprefix("next: ")
+    assert gsdmsr(f"{following} --set splats.count=50 --steps 2", monkeypatch) == 0
+    about = json.loads((tmp_path / "runs" / "a scene; (1)" / "run.json").read_text())
+    assert about["name"] == "dnerf"  # though the scene folder has nerfstudio's layout
+    assert "since the data has the layout dnerf" in capsys.readouterr().err
