@@ -42,7 +42,7 @@ from gsdmsr_cli.training import losses, population
 from gsdmsr_cli.training.trainer import Trainer
 
 ROOT = Path(__file__).parent.parent
-PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").glob("*.md")])
+PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")])
 COMMANDS = (
     "prepare", "train", "eval", "render", "export", "demo", "doctor", "weights", "benchmark",
 )  # fmt: skip
