@@ -19,6 +19,7 @@ def register(app: typer.Typer) -> None:
     group.command()(resume)
     group.command()(still)
     group.command()(soak)
+    group.command()(reading)
     app.add_typer(group, name="benchmark")
 
 
@@ -133,3 +134,15 @@ def soak(
     from gsdmsr_cli.commands import benchmark_soak
 
     benchmark_soak.run(command, every, as_json)
+
+
+def reading(
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder to write the capture to.")],
+    pictures: Annotated[int, typer.Option(min=2, metavar="N", help="Pictures.")] = 10_000,
+    points: Annotated[int, typer.Option(min=1, metavar="N", help="Points.")] = 5_000_000,
+    as_json: Json = False,
+) -> None:
+    """Write a large COLMAP model and measure how it is read: time and memory."""
+    from gsdmsr_cli.commands import benchmark_reading as command
+
+    command.run(out, pictures, points, as_json)

@@ -32,6 +32,9 @@ _MODELS = {
 
 _COUNTS = dict(_MODELS.values())
 
+_ROWS = 1 << 16
+"""Points that are taken from a binary file at a time."""
+
 
 class Image(NamedTuple):
     """A registered picture.
@@ -83,7 +86,7 @@ def read_model(folder: Path) -> ColmapModel:
     parse = (_cameras, _images, _points) if binary else (_cameras_text, _images_text, _points_text)
     cameras = dict(_whole(parse[0], paths[0]))
     images = sorted(_whole(parse[1], paths[1]), key=lambda image: image.name)
-    table = np.array(_whole(parse[2], paths[2]), np.float64).reshape(-1, 6)
+    table = np.concatenate([np.empty((0, 6)), *_whole(parse[2], paths[2])])
     table = table[np.isfinite(table).all(axis=1)]
     return ColmapModel(cameras, images, table[:, :3], (table[:, 3:] / 255).astype("f4"), paths)
 
@@ -164,15 +167,27 @@ def _images(path: Path) -> Iterator[Image]:
         raise ValueError("it ends too early")
 
 
-def _points(path: Path) -> Iterator[tuple[float, ...]]:
+def _points(path: Path) -> Iterator[Floats]:
+    """Yield the (P, 6) table of points at once: models have millions.
+
+    A point has 51 bytes and its track, so where one begins is known from the one before alone.
+    """
     data, at = path.read_bytes(), 8
-    for _ in range(*struct.unpack_from("<Q", data)):
-        row = struct.unpack_from("<3d3B", data, at + 8)
-        (track,) = struct.unpack_from("<Q", data, at + 43)
-        at += 51 + 8 * track
-        yield row
+    (count,) = struct.unpack_from("<Q", data)
+    if count > len(data) // 51:
+        raise ValueError("it ends too early")
+    starts, track = np.empty(count, np.int64), struct.Struct("<Q")
+    for i in range(count):
+        starts[i] = at
+        at += 51 + 8 * track.unpack_from(data, at + 43)[0]
     if at > len(data):
         raise ValueError("it ends too early")
+    content, table = np.frombuffer(data, np.uint8), np.empty((count, 6))
+    for first in range(0, count, _ROWS):
+        rows = content[starts[first : first + _ROWS, None] + np.arange(8, 8 + 27)]
+        table[first : first + _ROWS, :3] = np.ascontiguousarray(rows[:, :24]).view("<f8")
+        table[first : first + _ROWS, 3:] = rows[:, 24:]
+    yield table
 
 
 def _lines(path: Path) -> list[str]:
@@ -196,8 +211,9 @@ def _images_text(path: Path) -> Iterator[Image]:
             yield Image(words[9].strip(), _pose(tuple(map(float, words[1:8]))), int(words[8]))
 
 
-def _points_text(path: Path) -> Iterator[tuple[float, ...]]:
+def _points_text(path: Path) -> Iterator[Floats]:
+    """Yield a (1, 6) table per point."""
     for line in _lines(path):
         if words := line.split():
             x, y, z, red, green, blue = map(float, words[1:7])
-            yield x, y, z, red, green, blue
+            yield np.array([[x, y, z, red, green, blue]])

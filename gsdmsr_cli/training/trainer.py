@@ -80,7 +80,9 @@ class Trainer:
         self.workers = WorkerPool(self.renderer)
         self.generator = torch.Generator().manual_seed(preset.training.seed)
         background = torch.tensor(BACKGROUNDS[preset.data.background])
-        splats = initial_splats(scene, preset.splats, pictures, background, self.generator)
+        splats = initial_splats(
+            scene, preset.splats, pictures, background, self.generator, preset.density.cap
+        )
         self.facts = facts_of(scene, splats)
         model = start_model(
             splats, preset.motion, preset.layers, self.facts, self.generator,

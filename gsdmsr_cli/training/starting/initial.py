@@ -31,15 +31,17 @@ def initial_splats(
     pictures: Pictures,
     background: Tensor,
     generator: torch.Generator,
+    most: int,
 ) -> Splats:
     """Return isotropic splats as large as the distance to their neighbours (3DGS, section 5.1).
 
-    They sit at the scene's own points. Where there are none, or the start is "surfaces" and there
-    are fewer than ``options.count``, others join them as ``options.start`` says: at random in the
-    box and nearly grey, as all methods do on D-NeRF; where silhouettes overlap; or on surfaces.
+    They sit at the scene's own points, or at ``most`` of them chosen at random. Where there are
+    none, or the start is "surfaces" and there are fewer than ``options.count``, others join them as
+    ``options.start`` says: at random in the box and nearly grey, as all methods do on D-NeRF; where
+    silhouettes overlap; or on surfaces.
     """
-    given = _given_points(scene, pictures)
-    wanted = options.count - len(given.means)
+    given = _given_points(scene, pictures, most, generator)
+    wanted = min(options.count, most) - len(given.means)
     if not len(given.means) or (options.start == "surfaces" and wanted > 0):
         more = _new_points(scene, options.start, wanted, pictures, background, generator)
         given = Points(*map(torch.cat, zip(given, more, strict=True)))
@@ -58,12 +60,17 @@ def initial_splats(
     )
 
 
-def _given_points(scene: Scene, pictures: Pictures) -> Points:
+def _given_points(
+    scene: Scene, pictures: Pictures, most: int, generator: torch.Generator
+) -> Points:
     """Return the scene's points, coloured from the pictures if the format has no colours."""
     means = torch.from_numpy(scene.points)
+    chosen: slice | Tensor = slice(None)
+    if len(means) > most:
+        chosen = torch.randperm(len(means), generator=generator)[:most].sort().values
     if scene.colours is None:
-        return Points(means, colours_of(means, scene, pictures))
-    return Points(means, torch.from_numpy(scene.colours))
+        return Points(means[chosen], colours_of(means[chosen], scene, pictures))
+    return Points(means[chosen], torch.from_numpy(scene.colours)[chosen])
 
 
 def _new_points(

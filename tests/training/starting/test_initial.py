@@ -27,11 +27,11 @@ def scene_of(points: np.ndarray | None = None, bound: float = BOUND) -> Scene:
     return Scene(Path(), "test", (), points, colours, None, bound, "")
 
 
-def start(scene: Scene, seed: int = 0, **options: Any) -> Splats:
+def start(scene: Scene, seed: int = 0, most: int = 10_000, **options: Any) -> Splats:
     """Return the splats of a scene without pictures."""
     chosen = SplatOptions(**{"start": "box", **options})
     pictures = Pictures((1.0, 1.0, 1.0), 1, 0)
-    return initial_splats(scene, chosen, pictures, torch.ones(3), generator(seed))
+    return initial_splats(scene, chosen, pictures, torch.ones(3), generator(seed), most)
 
 
 def grid_of(step: float, offset: float = 0.0) -> np.ndarray:
@@ -90,3 +90,16 @@ def test_few_or_coincident_points_have_finite_scales() -> None:
     assert pair.log_scales.exp().numpy() == pytest.approx(math.sqrt(2))
     same = start(scene_of(np.ones((9, 3))))
     assert same.log_scales.isfinite().all()
+
+
+def test_there_are_never_more_than_the_cap() -> None:
+    points = np.random.default_rng(1).random((500, 3), np.float32)
+    scene = scene_of(points)
+    splats = start(scene, most=60)
+    # some of the points, each with its own colour, in their order and from all of them
+    rows = [int(np.flatnonzero((points == mean).all(axis=1))[0]) for mean in splats.means.numpy()]
+    assert len(rows) == 60 and rows == sorted(set(rows)) and rows[0] < 100 and rows[-1] > 400
+    assert scene.colours is not None
+    np.testing.assert_allclose(0.5 + SH_C0 * splats.sh[:, 0], scene.colours[rows], atol=1e-6)
+    assert len(start(scene, most=500)) == 500
+    assert len(start(scene_of(), most=60, count=100)) == 60

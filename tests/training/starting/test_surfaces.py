@@ -111,12 +111,12 @@ def test_surfaces_join_points_that_are_too_few() -> None:
     scene = replace(scene, points=few, colours=np.full((2, 3), 0.25, np.float32))
     for count, total in ((40, 40), (2, 2), (1, 2)):
         options = SplatOptions(start="surfaces", count=count)
-        splats = initial_splats(scene, options, pictures, torch.ones(3), generator(0))
+        splats = initial_splats(scene, options, pictures, torch.ones(3), generator(0), 100)
         assert len(splats) == total
         assert torch.equal(splats.means[:2], torch.from_numpy(few))
         assert (SH_C0 * splats.sh[:2, 0] + 0.5).numpy() == pytest.approx(0.25)
     options = SplatOptions(start="box", count=40)
-    assert len(initial_splats(scene, options, pictures, torch.ones(3), generator(0))) == 2
+    assert len(initial_splats(scene, options, pictures, torch.ones(3), generator(0), 100)) == 2
 
 
 def test_the_seed_decides() -> None:
