@@ -27,7 +27,8 @@ from gsdmsr_cli.cli import (
 )
 from gsdmsr_cli.cli import eval as evaluate
 from gsdmsr_cli.ground import origin
-from gsdmsr_cli.ground.errors import GsdmsrError, UsageError
+from gsdmsr_cli.ground.errors import DataError, GsdmsrError, UsageError
+from gsdmsr_cli.ground.streams import unfailing
 
 # These files import gsdmsr_cli.commands in the functions that run them: torch alone would make
 # --help slow.
@@ -86,23 +87,31 @@ def main() -> None:
 
 
 def _run() -> int:
+    with unfailing() as lost:
+        code, reason = _call(), lost()
+        if reason is not None and code == 0:
+            _tell(f"standard output cannot be written: {reason}; what was asked for is not whole")
+            code = DataError.exit_code
+    return code
+
+
+def _call() -> int:
     try:
         with ctrl_c_that_spares_imports():
             result = typer.main.get_command(app).main(prog_name="gsdmsr", standalone_mode=False)
     except (KeyboardInterrupt, typer.Abort):
         return 130
-    except BrokenPipeError:
-        # the reader of our output has left, as in `gsdmsr doctor | head -1`; keep Python's own
-        # flush at exit from failing on the same pipe
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 0
     except Exception as error:
         if os.environ.get("GSDMSR_DEBUG"):
             traceback.print_exc()
         message, code = _explain(error)
-        typer.echo(f"error: {' '.join(message.split())}", err=True)
+        _tell(message)
         return code
     return result if isinstance(result, int) else 0
+
+
+def _tell(message: str) -> None:
+    typer.echo(f"error: {' '.join(message.split())}", err=True)
 
 
 @contextmanager

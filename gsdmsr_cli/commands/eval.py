@@ -59,13 +59,13 @@ def run(
     document = measure(trained, request)
     verdicts = gates.judge(document)
     write_json(folder / "metrics.json", document)
-    _print(document, verdicts, folder / "metrics.json", output.as_json)
     if output.junit:
         write_text(output.junit, junit("gsdmsr.eval", document, verdicts))
     if summary_path:
         _append(summary_path, markdown(_heading(run_folder), document, verdicts))
     if output.report:
-        _report(folder, trained, document, verdicts, output.as_json)
+        _report(folder, trained, document, verdicts)
+    _print(document, verdicts, folder, output)  # last: whoever reads it may have left
     missed = [verdict.found for verdict in verdicts if not verdict.passed]
     if missed:
         raise ThresholdError("; ".join(missed))
@@ -76,21 +76,15 @@ def _heading(run_folder: Path) -> str:
 
 
 def _report(
-    folder: Path,
-    trained: Trained,
-    document: Document,
-    verdicts: Sequence[Verdict],
-    quietly: bool,
+    folder: Path, trained: Trained, document: Document, verdicts: Sequence[Verdict]
 ) -> None:
-    """Write the report for people, as HTML and as Markdown, and say where unless ``quietly``."""
+    """Write the report for people, as HTML and as Markdown."""
     root = trained.run.root
     views, frames = trained.scene.split(document["protocol"]["split"]), document["frames"]
     shown, full = make_report_frames(trained.renderer, views, frames)
     html = page(root.resolve().name, document, verdicts, trained.run.read_log(), shown, full)
     write_text(folder / "report.md", markdown(_heading(root), document, verdicts))
     write_text(folder / "report.html", html)
-    if not quietly:
-        Console().out(f"report: {folder / 'report.html'}", highlight=False)
 
 
 def _summary_path() -> Path:
@@ -108,15 +102,17 @@ def _append(path: Path, text: str) -> None:
         raise DataError(f"{path}: cannot be written: {error.strerror or error}") from error
 
 
-def _print(document: Document, verdicts: Sequence[Verdict], path: Path, as_json: bool) -> None:
+def _print(document: Document, verdicts: Sequence[Verdict], folder: Path, output: Output) -> None:
     console = Console()
-    if as_json:
+    if output.as_json:
         console.out(json.dumps(document), highlight=False)
         return
     console.print(_table(document))
     for verdict in verdicts:
         console.out(f"{'passed' if verdict.passed else 'FAILED'}: {verdict.found}", highlight=False)
-    console.out(f"written to {path}", highlight=False)
+    console.out(f"written to {folder / 'metrics.json'}", highlight=False)
+    if output.report:
+        console.out(f"report: {folder / 'report.html'}", highlight=False)
 
 
 def _table(document: Document) -> Table:

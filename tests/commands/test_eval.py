@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
 import re
+import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -16,6 +18,7 @@ import numpy as np
 import pytest
 import torch
 from datasets import write_picture
+from sinks import SINKS, sink
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 from torchmetrics.functional.image import multiscale_structural_similarity_index_measure
 
@@ -205,6 +208,25 @@ def test_gates_are_told_everywhere(
     assert (suite.get("tests"), suite.get("failures")) == ("3", "2")
     text = told.read_text()
     assert text.startswith("before\n## gsdmsr eval run\n") and text.count("**failed**") == 2
+
+
+@pytest.mark.parametrize("lost", SINKS)
+def test_every_file_is_written_though_nobody_gets_what_is_printed(
+    run: Path, tmp_path: Path, lost: str
+) -> None:
+    wishes = "--json", "--report", "--fail-under", "psnr=99", "--out", str(tmp_path / "eval")
+    files = "--junit", str(tmp_path / "j.xml"), "--github-summary"
+    command = [sys.executable, "-m", "gsdmsr_cli", "eval", str(run), *wishes, *files]
+    told = os.environ | {"GITHUB_STEP_SUMMARY": str(tmp_path / "summary.md")}
+    with sink(lost) as out:
+        ended = subprocess.run(command, stdout=out, stderr=subprocess.PIPE, env=told, check=False)
+    assert ended.returncode == 4 and ended.stderr.count(b"\n") == 1
+    assert ended.stderr.startswith(b"error: psnr is ")
+    assert {path.name for path in (tmp_path / "eval").iterdir()} == {
+        "metrics.json", "report.html", "report.md",
+    }  # fmt: skip
+    assert ElementTree.parse(tmp_path / "j.xml").getroot().get("failures") == "1"
+    assert "**failed**" in (tmp_path / "summary.md").read_text()
 
 
 def test_a_run_is_as_good_as_itself_and_not_as_good_as_a_better_one(
