@@ -119,6 +119,9 @@ def test_demands_that_make_no_sense_are_refused(demands: Demands, message: str) 
 
 def test_a_tolerance_is_not_negative(tmp_path: Path) -> None:
     earlier = written(tmp_path / "a.json", report(psnr=25.0))
+    exact = read_gates(Demands(baseline=earlier, tolerance=("psnr=0",)))
+    for psnr, passed in ((25.0, True), (24.999, False)):
+        assert [verdict.passed for verdict in exact.judge(report(psnr=psnr))] == [passed]
     with pytest.raises(UsageError, match="psnr=-1: allowed: 0 or more"):
         read_gates(Demands(baseline=earlier, tolerance=("psnr=-1",)))
 

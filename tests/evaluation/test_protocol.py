@@ -50,6 +50,15 @@ def test_psnr_is_of_rounded_pictures_and_psnr_float_is_not() -> None:
     assert scores["psnr_float"] == pytest.approx(20 * math.log10(255 / 1.4), abs=1e-3)
 
 
+def test_ssim_is_of_rounded_pictures() -> None:
+    """Waves of 0.4 of a level are gone after rounding, and with them all that differs."""
+    level = 100 + 0.4 * torch.sin(torch.arange(14.0))
+    drawn = (level / 255).expand(12, 14)[..., None].expand(12, 14, 3)
+    true = grey(100 / 255)
+    assert score(drawn, true, {})["ssim"] == pytest.approx(1.0, abs=1e-6)
+    assert ssim(drawn, true) < 1 - 1e-5
+
+
 def test_drawn_values_outside_are_clamped() -> None:
     assert score(grey(7.0), grey(1.0), {})["psnr_float"] == 100.0
     assert score(grey(-3.0), grey(0.0), {})["psnr"] == 100.0

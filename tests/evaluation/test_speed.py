@@ -93,6 +93,23 @@ def test_shots_are_drawn_in_turn_each_with_its_moment(stage: Stage, count: int) 
     assert different[-1] + steps[0] >= 1 - 1e-9
 
 
+def test_what_has_only_been_asked_for_counts_once_it_is_there(stage: Stage) -> None:
+    """A device that takes orders at once, and has done them when it is waited for."""
+    ordered: list[int] = []
+
+    def wait() -> None:
+        stage.now += DRAW_S * len(ordered)
+        ordered.clear()
+
+    def draw(i: int) -> None:
+        stage.now += 0.01
+        ordered.append(i)
+
+    rate, frames = speed._rate(draw, 7, wait)
+    assert frames == pytest.approx(SECONDS / 0.01, abs=1)
+    assert rate == pytest.approx(1 / (0.01 + DRAW_S))
+
+
 def test_slow_drawing_sees_every_shot_once(stage: Stage, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(speed, "SECONDS", 0.0)
     assert measured(stage, shots_of(7)).frames == 7

@@ -211,6 +211,18 @@ KINDS = [
 ]  # fmt: skip
 
 
+def test_harmonics_above_the_third_degree_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "a.ply"
+    write_ply(path, make_splats(5, 3))
+    header, body = path.read_bytes().split(b"end_header\n")
+    more = "".join(f"property float f_rest_{i}\n" for i in range(45, 72)).encode()
+    rows = np.frombuffer(body, "<f4").reshape(5, -1)
+    wider = np.concatenate([rows, np.zeros((5, 27), "<f4")], axis=1)
+    path.write_bytes(header + more + b"end_header\n" + wider.tobytes())
+    with pytest.raises(DataError, match="has 72 f_rest properties; allowed: 0, 9, 24, 45"):
+        read_ply(tmp_path / "a.ply")
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_broken_files_are_bad_data_in_one_line(tmp_path: Path, kind: str) -> None:
     path = tmp_path / "a.ply"

@@ -35,9 +35,22 @@ POINTS = np.random.default_rng(3).normal(size=(80, 3)) * 0.3 + [0.0, 0.0, 4.0]
 COLOURS = np.random.default_rng(4).integers(0, 256, (80, 3))
 
 
+AXIS = np.array([0.48, 0.6, 0.64])
+"""Of unit length, and of no two coordinates alike."""
+
+
 def quaternion(i: int) -> list[float]:
-    """A turn of i / 50 about the y axis, wxyz."""
-    return [float(np.cos(i / 100)), 0.0, float(np.sin(i / 100)), 0.0]
+    """A turn of i / 25 about ``AXIS``, wxyz, of a length of its own."""
+    half = i / 50
+    return [(0.5 + i) * float(part) for part in (np.cos(half), *(np.sin(half) * AXIS))]
+
+
+def rotation(i: int) -> np.ndarray:
+    """That turn, by the formula of Rodrigues."""
+    x, y, z = AXIS
+    across = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    angle = i / 25
+    return np.eye(3) + np.sin(angle) * across + (1 - np.cos(angle)) * across @ across
 
 
 def translation(i: int) -> list[float]:
@@ -106,11 +119,8 @@ def test_points_fall_where_colmap_projects_them(
     assert int(camera.model) == number
     for i, view in enumerate(scene.views):
         assert view.name == f"f{i:03d}"
-        angle = i / 50
-        rotation = np.array(
-            [[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]]
-        )
-        local = POINTS @ rotation.T + translation(i)
+        np.testing.assert_allclose(view.camera.rotation, rotation(i), atol=1e-9)
+        local = POINTS @ rotation(i).T + translation(i)
         expected = camera.img_from_cam(local)
         normalized = scene.points @ view.camera.rotation.T + view.camera.translation
         x, y = (normalized[:, :2] / normalized[:, 2:]).T

@@ -171,9 +171,33 @@ def test_a_capture_without_points_is_normalized_by_its_cameras(folder: Path) -> 
 
 
 def test_pictures_are_undistorted_when_they_are_decoded(folder: Path) -> None:
-    view = read_scene(folder).views[0]
+    """A ramp of levels across the picture tells where each pixel was taken from."""
+    rows, columns = np.mgrid[:32, :20]
+    ramps = np.stack([10 * columns, 7 * rows, 0 * rows], axis=2)
+    write_picture(folder / "rgb" / "2x" / "000000.png", ramps.astype(np.uint8))
+    view = next(view for view in read_scene(folder).views if view.name == "000000")
     picture = Pictures((1.0, 1.0, 1.0), 1, 1 << 20).load(view)
     assert picture.shape == (3, 32, 20)
+    camera, own = view.camera, camera_at(0.0)
+    for column, row in ((4, 5), (10, 16), (15, 25), (7, 27)):
+        ahead = [(column + 0.5 - camera.cx) / camera.fx, (row + 0.5 - camera.cy) / camera.fy, 1.0]
+        u, v = by_hand(own, np.array(own["position"]) + ahead)  # the camera is not turned
+        found = picture[:, row, column].tolist()
+        assert found[0] == pytest.approx(10 * (u / 2 - 0.5), abs=1.0)
+        assert found[1] == pytest.approx(7 * (v / 2 - 0.5), abs=1.0)
+
+
+def test_without_points_the_depths_of_the_scene_tell_where_it_is(folder: Path) -> None:
+    """They are in units of the scale: 0.5 to 8 at 0.5 are 1 to 16, in the middle 4 (geometric)."""
+    (folder / "points.npy").unlink()
+    write_json(folder / "scene.json", {"scale": 0.5, "center": [0, 0, 0], "near": 0.5, "far": 8})
+    for i, path in enumerate(sorted((folder / "camera").glob("*.json"))):
+        straight = np.eye(3).tolist()
+        edit(path, lambda c, i=i, r=straight: c.update(orientation=r, position=[0.1 * i, 0, 0]))
+    views = {view.name: view.camera for view in read_scene(folder).views}
+    # all cameras lie in one plane, 4 before the middle, which comes to be the origin
+    for i, camera in enumerate(views[f"{i:06d}"] for i in range(9)):
+        np.testing.assert_allclose(camera.translation, [0.4 - 0.1 * i, 0, 4.0], atol=1e-6)
 
 
 def write(name: str, change: Callable[[dict[str, Any]], Any]) -> Callable[[Path], None]:

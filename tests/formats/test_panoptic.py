@@ -93,6 +93,42 @@ def test_what_moves_is_1_in_seg(folder: Path) -> None:
     assert moving[:, :10].all() and not moving[:, 10:].any()
 
 
+def test_pictures_may_have_been_halved(folder: Path) -> None:
+    for kind, channels in (("ims", 3), ("seg", 1)):
+        for path in (folder / kind).glob("*/*.png"):
+            write_picture(path, noise(HEIGHT // 2, WIDTH // 2, channels))
+    for view in read_scene(folder).views:
+        c = view.camera
+        assert (c.width, c.height) == (WIDTH // 2, HEIGHT // 2)
+        assert (c.fx, c.fy, c.cx, c.cy) == (20, 20.5, 7.75, 6.25)
+
+
+def test_points_that_are_no_numbers_are_left_out(folder: Path) -> None:
+    expected = read_scene(folder)
+    table = np.concatenate([POINTS, COLOURS, np.ones((len(POINTS), 1))], axis=1)
+    broken = table[:4].copy()
+    broken[[0, 1, 2, 3], [0, 2, 4, 1]] = [np.nan, np.inf, np.nan, -np.inf]
+    points(np.concatenate([broken[:2], table, broken[2:]]))(folder)
+    found = read_scene(folder)
+    np.testing.assert_array_equal(found.points, expected.points)
+    np.testing.assert_array_equal(found.colours, expected.colours)
+
+
+def test_the_world_is_that_of_the_first_moment_where_the_rig_moves(folder: Path) -> None:
+    """All cameras leave by 100 at once; the points, which lie where they began, are the measure."""
+    still = read_scene(folder)
+
+    def leave(document: dict[str, Any]) -> None:
+        for t, poses in enumerate(document["w2c"]):
+            for pose in poses:
+                pose[2][3] += 100.0 * t
+
+    change(leave)(folder)
+    moved = read_scene(folder)
+    np.testing.assert_allclose(moved.points, still.points, rtol=1e-6)
+    assert moved.bound == pytest.approx(still.bound)
+
+
 def test_seg_points_and_the_test_split_may_be_missing(folder: Path) -> None:
     (folder / "seg").rename(folder / "other")
     (folder / "init_pt_cld.npz").unlink()

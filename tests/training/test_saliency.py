@@ -122,6 +122,13 @@ def test_new_splats_have_grace_and_so_have_restarted_ones() -> None:
     assert saliency.high.tolist() == [False, True]
 
 
+def test_what_begins_anew_is_held_as_long_as_what_is_new() -> None:
+    saliency = saliency_of(threshold=1.0, hold=3)
+    assert classes(saliency, [0.0] * 9)[3:] == [False] * 6  # low, and old enough to change again
+    saliency.restart(ALL)
+    assert classes(saliency, [0.0] * 4) == [True, True, True, False]
+
+
 def test_scores_are_smoothed_over_the_steps_that_saw_the_splat() -> None:
     saliency = saliency_of(2, threshold=1.0, smoothing=0.9)
     saliency.observe(torch.tensor([3.0, 3.0]), torch.tensor([True, False]))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from collections.abc import Mapping
 from functools import cache
 
 import pytest
@@ -21,7 +22,9 @@ from motion_checks import (
     start_motion,
     started,
 )
+from scipy.spatial.transform import Rotation
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from gsdmsr_cli.gaussians.moment import Moment
 from gsdmsr_cli.gaussians.splats import Splats
@@ -29,7 +32,8 @@ from gsdmsr_cli.ground import plugins
 from gsdmsr_cli.ground.errors import UsageError
 from gsdmsr_cli.model import motion as motions
 from gsdmsr_cli.model.layer import Facts, Instant, Layer, options_of
-from gsdmsr_cli.ops.planes import CUBE
+from gsdmsr_cli.model.motion.multiscale import SMOOTH_ROWS
+from gsdmsr_cli.ops.planes import CUBE, Level, lookup_twin, penalty_twin
 from gsdmsr_cli.training.rates import NAMED
 
 TIMES = (0.0, 0.3, 1.0)
@@ -295,12 +299,101 @@ def test_multiscale_keeps_the_splats_own_features_small(fine: bool) -> None:
     torch.testing.assert_close(penalty, expected)
 
 
-def test_multiscale_without_the_pyramid_gives_the_decoder_fewer_inputs() -> None:
-    inputs = [
-        started("multiscale", pyramid=pyramid).tensors()["decoder.0.weight"].shape[0]
-        for pyramid in (True, False)
+def exact(tensors: Mapping[str, Tensor], name: str) -> list[Tensor]:
+    """Return the tensors of a grid or a network in float64."""
+    return [t.detach().double() for what, t in tensors.items() if what.startswith(f"{name}.")]
+
+
+def grid_of(tensors: Mapping[str, Tensor], name: str) -> list[Level]:
+    parts = exact(tensors, name)
+    return [Level(*pair) for pair in zip(parts[::2], parts[1::2], strict=True)]
+
+
+def features_of(tensors: Mapping[str, Tensor], name: str, means: Tensor, time: float) -> Tensor:
+    return lookup_twin(grid_of(tensors, name), means.double(), 2 * time - 1, FACTS.box)
+
+
+def decoded(x: Tensor, parts: list[Tensor]) -> Tensor:
+    """A network with a ReLU after every layer but the last one."""
+    for i, (weight, bias) in enumerate(zip(parts[::2], parts[1::2], strict=True)):
+        x = (x.relu() if i else x) @ weight + bias
+    return x
+
+
+@pytest.mark.parametrize("pyramid", [True, False])
+def test_multiscale_is_its_formula(pyramid: bool) -> None:
+    """x + both offsets, q and log s + the fine one; the decoder reads coarse features or not."""
+    splats, time = splats_of(COUNT), 0.3
+    motion = disturbed(started("multiscale", COUNT, pyramid=pyramid, coarse_channels=32))
+    tensors = motion.tensors()
+    coarse, fine = (features_of(tensors, name, splats.means, time) for name in ("coarse", "fine"))
+    own = tensors["embeddings"].detach().double()
+    given = torch.cat([coarse, fine, own] if pyramid else [fine, own], dim=1)
+    offset, turn, growth = decoded(given, exact(tensors, "decoder")).split([3, 4, 3], dim=1)
+    offset = offset + decoded(coarse, exact(tensors, "coarse_decoder"))
+    found = moved_by(motion, splats, time)
+    for name, change in (("means", offset), ("quats", turn), ("log_scales", growth)):
+        moved = found.tensors()[name].double() - splats.tensors()[name]
+        torch.testing.assert_close(moved, change, rtol=1e-4, atol=1e-5, msg=name)
+        assert change.abs().max() > 0.01
+
+
+def test_hexplane_has_heads_that_do_not_read_one_another() -> None:
+    """As three networks, each with a hidden layer of its own after the one that they share."""
+    splats, width = splats_of(COUNT), 32
+    motion = disturbed(started("hexplane", heads="separate", width=width, levels=[8], channels=16))
+    tensors = motion.tensors()
+    first, bias, second, second_bias, last, last_bias = exact(tensors, "network")
+    x = (features_of(tensors, "grid", splats.means, 0.3) @ first + bias).relu()
+    found, begin = moved_by(motion, splats, 0.3), 0
+    for head, (name, size) in enumerate((("means", 3), ("quats", 4), ("log_scales", 3))):
+        own, to = slice(width * head, width * (head + 1)), slice(begin, begin + size)
+        change = (x @ second[:, own] + second_bias[own]).relu() @ last[own, to] + last_bias[to]
+        moved = found.tensors()[name].double() - splats.tensors()[name]
+        torch.testing.assert_close(moved, change, rtol=1e-4, atol=1e-5, msg=name)
+        begin += size
+
+
+@pytest.mark.parametrize("fine", [False, True])
+def test_multiscale_regularises_the_grids_that_are_active(fine: bool) -> None:
+    weights = {"space_smoothness": 0.3, "time_smoothness": 0.7, "time_stillness": 0.2}
+    motion = disturbed(started("multiscale", offset_weight=0.0, coarse_until=0.5, **weights))
+    motion.advance(1.0 if fine else 0.0)
+    tensors = motion.tensors()
+    levels = grid_of(tensors, "coarse") + (grid_of(tensors, "fine") if fine else [])
+    expected = penalty_twin(levels, *weights.values())
+    found = penalty_of(motion, splats_of(COUNT), 0.6, generator())
+    assert found is not None
+    torch.testing.assert_close(found.double(), expected, rtol=1e-5, atol=0)
+
+
+def test_multiscale_smooths_the_decoder_over_a_reach_in_units_of_the_bound() -> None:
+    """The mean squared difference of all outputs at a splat and beside it, in float64."""
+    splats, time = splats_of(COUNT), 0.6
+    weights = {"offset_weight": 0.0, "smooth_weight": 5.0, "smooth_reach": 0.03, **NO_PLANE_TERMS}
+    motion = disturbed(started("multiscale", COUNT, **weights))
+    found = penalty_of(motion, splats, time, generator(7))
+    source, tensors = generator(7), motion.tensors()
+    rows = torch.randint(COUNT, (SMOOTH_ROWS,), generator=source)
+    places = splats.means[rows]
+    beside = places + 0.03 * FACTS.bound * torch.randn(places.shape, generator=source)
+    outputs = [
+        decoded(
+            torch.cat(
+                [
+                    features_of(tensors, "coarse", at, time),
+                    features_of(tensors, "fine", at, time),
+                    tensors["embeddings"].detach().double()[rows],
+                ],
+                dim=1,
+            ),
+            exact(tensors, "decoder"),
+        )
+        for at in (places, beside)
     ]
-    assert inputs[0] - inputs[1] == 16
+    expected = 5.0 * (outputs[0] - outputs[1]).square().sum(dim=1).mean()
+    assert found is not None
+    torch.testing.assert_close(found.double(), expected, rtol=1e-3, atol=0)
 
 
 def test_multiscale_as_in_the_method_holds_nothing_per_splat() -> None:
@@ -390,6 +483,28 @@ def test_control_points_are_anchored_to_splats_that_show_and_all_goes_on_nearly_
     assert float(jumped.detach()) < 0.5 * float(moved.detach())
 
 
+def spacing_of(points: Tensor) -> Tensor:
+    """Root mean square of the distances to the three nearest others, in float64."""
+    squares = torch.cdist(points.double(), points.double()).square()
+    return squares.fill_diagonal_(torch.inf).sort(dim=1).values[:, :3].mean(dim=1).sqrt()
+
+
+@torch.no_grad()
+def test_radii_of_control_points_are_how_far_apart_they_are() -> None:
+    """At the start and wherever they are anchored; never below a thousandth of the bound."""
+    motion = control_points_of(300, count=30)
+    points, log_radii = (motion.tensors()[name] for name in ("control_points", "log_radii"))
+    torch.testing.assert_close(log_radii.exp(), spacing_of(points).float())
+    splats = splats_of(300)
+    splats.means.mul_(0.1)
+    motion.reanchor(splats)
+    torch.testing.assert_close(log_radii.exp(), spacing_of(points).float())
+    assert log_radii.exp().max() < 0.2
+    splats.means.fill_(0.5)
+    motion.reanchor(splats)
+    torch.testing.assert_close(log_radii.exp(), torch.full((30,), 1e-3 * FACTS.bound))
+
+
 def test_control_points_are_anchored_where_splats_are_if_too_few_of_them_show() -> None:
     splats, motion = splats_of(20), control_points_of(20, count=30)
     splats.logit_opacities.fill_(-9.0)
@@ -429,6 +544,33 @@ def test_control_points_follow_splats_that_have_changed_since() -> None:
 def test_control_points_refuse_numbers_out_of_range(options: dict[str, int], found: str) -> None:
     with pytest.raises(UsageError, match=found):
         control_points_of(1, **options)
+
+
+def test_the_rigidity_of_control_points_has_its_weight() -> None:
+    """What the mean over pairs is of |A_i (p_j - p_i) + p_i + t_i - (p_j + t_j)|^2 / |p_j - p_i|^2.
+
+    In float64, of each point and the nearest four, itself among them.
+    """
+    options = {"count": 20, "neighbours": 4, "rigidity": 3.0, **NO_PLANE_TERMS}
+    motion = disturbed(started("control_points", **options))
+    found = penalty_of(motion, splats_of(COUNT), 0.6, generator(5))
+    time, tensors = float(torch.rand((), generator=generator(5))), motion.tensors()
+    points = tensors["control_points"].detach().double()
+    features = features_of(tensors, "grid", points, time)
+    offset, turn, _ = decoded(features, exact(tensors, "network")).split([3, 4, 3], dim=1)
+    w, x, y, z = normalize(turn + turn.new_tensor([1.0, 0.0, 0.0, 0.0]), dim=1).unbind(1)
+    rotations = torch.from_numpy(
+        Rotation.from_quat(torch.stack([x, y, z, w], dim=1).numpy()).as_matrix()
+    )
+    near = torch.cdist(points, points).argsort(dim=1)[:, :4]
+    shares = []
+    for i in range(20):
+        for j in near[i].tolist():
+            apart = points[j] - points[i]
+            off = rotations[i] @ apart + points[i] + offset[i] - points[j] - offset[j]
+            shares.append(float(off.square().sum() / apart.square().sum()) if i != j else 0.0)
+    assert found is not None
+    assert found.item() == pytest.approx(3.0 * sum(shares) / len(shares), rel=1e-3)
 
 
 def test_control_points_are_to_move_as_parts_of_a_rigid_body() -> None:

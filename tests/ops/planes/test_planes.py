@@ -149,6 +149,20 @@ def test_no_points_have_no_features_and_give_no_gradient(look: Any) -> None:
         assert tensor.grad is not None and not tensor.grad.any()
 
 
+def test_gradients_of_few_rows_belong_to_their_points() -> None:
+    """Which only those rows go through; the others' are zero."""
+    start, live = [points_of(200), *tensors_of([(5, 4, 16), (3, 2, 16)])], [3, 40, 41, 199]
+    slope = torch.zeros(200, 32)
+    slope[live] = torch.randn(4, 32, generator=generator(4))
+    ours, exact = leaves(start, torch.float32), leaves(start, torch.float64)
+    planes.lookup(levels_of(ours[1:]), ours[0], 0.3).backward(slope)
+    planes.lookup_twin(levels_of(exact[1:]), exact[0], 0.3).backward(slope.double())
+    for i, (a, b) in enumerate(zip(ours, exact, strict=True)):
+        assert_near(a.grad, b.grad, 1e-4, f"gradient {i}")
+    assert ours[0].grad is not None
+    assert (ours[0].grad != 0).any(dim=1).nonzero().flatten().tolist() == live
+
+
 def test_lookup_without_a_gradient_of_the_points() -> None:
     start, points = tensors_of([(5, 4, 16)]), points_of(7)
     ours, exact = leaves(start, torch.float32), leaves(start, torch.float64)

@@ -83,6 +83,17 @@ def test_rigidity_is_relative_to_the_distance() -> None:
         torch.testing.assert_close(value, torch.tensor(0.5 * 0.15**2))
 
 
+def test_points_almost_at_one_place_do_not_outweigh_the_others() -> None:
+    """Their square counts as a ten thousandth of the mean, which is 2 / 3 of three pairs."""
+    points = torch.tensor([[0.0, 0.0, 0.0], [1e-6, 0.0, 0.0], [1.0, 0.0, 0.0]])
+    deformation = torch.zeros(3, OUTPUTS)
+    deformation[1, 1] = 0.3
+    near = torch.tensor([[1, 2], [0, 2], [0, 1]], dtype=torch.int32)
+    value = rigidity(points, transforms(points, deformation), near)
+    expected = (2 * 0.09 / (1e-4 * 2 / 3) + 2 * 0.09) / 6
+    assert value.item() == pytest.approx(expected, rel=1e-4)
+
+
 def test_points_at_one_place_are_rigid_with_each_other() -> None:
     points = torch.tensor([[1.0, 2.0, 3.0], [1.0, 2.0, 3.0], [0.0, 0.0, 0.0]])
     deformation = torch.zeros(3, OUTPUTS, requires_grad=True)

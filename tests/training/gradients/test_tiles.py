@@ -57,6 +57,14 @@ def test_tiles_with_a_large_error_are_chosen_more_often() -> None:
     torch.testing.assert_close(often, expected, atol=0.05, rtol=0)
 
 
+def test_a_tile_not_seen_yet_counts_as_an_average_one() -> None:
+    """Errors 1 and 3 are known, so the others count as 2; of a single draw the weight is 1 / q."""
+    sampler, rng = sampler_of([float("nan"), 1.0, 3.0, float("nan")], 1), generator()
+    found = torch.stack([sampler.choose(0, 4, rng) for _ in range(200)]).amax(dim=0)
+    chances = torch.tensor([0.125 + 0.125, 0.125 + 0.0625, 0.125 + 0.1875, 0.125 + 0.125])
+    torch.testing.assert_close(found, 1 / chances)
+
+
 def test_only_what_has_been_drawn_is_learnt() -> None:
     sampler = TileSampler(2)
     sampler.learn(3, torch.tensor([0.0, 2.0, 1.0]), torch.tensor([0.0, 5.0, 7.0]).double())

@@ -85,6 +85,15 @@ def test_a_large_splat_gives_way_to_two_smaller_ones() -> None:
     assert (after.means[2:] - splats.means[1]).norm(dim=1).max() < 5 * LARGE
 
 
+def test_sizes_are_compared_in_units_of_the_scenes_radius() -> None:
+    """Of radius 2: split above 0.1, pruned above 1; each size lies within 5 % of a threshold."""
+    rows, fresh, after = grown(splats_of([0.095, 0.105, 0.95, 1.05]), [1.0, 1.0, 0.0, 1.0])
+    assert rows == [0, 2, 0, 1, 1] and fresh == [False, False, True, True, True]
+    sizes = after.log_scales.exp().amax(dim=1)
+    child = 0.105 / SPLIT_SHRINK
+    torch.testing.assert_close(sizes, torch.tensor([0.095, 0.95, 0.095, child, child]))
+
+
 def test_children_are_drawn_from_their_parents_gaussian() -> None:
     one = splats_of([LARGE])
     splats = one.take(torch.zeros(4000, dtype=torch.long))
