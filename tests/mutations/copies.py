@@ -57,7 +57,7 @@ class Copy:
             mine, theirs = self.folder / name, ROOT / name
             if not mine.is_file() or mine.read_bytes() != theirs.read_bytes():
                 mine.parent.mkdir(parents=True, exist_ok=True)
-                shutil.copyfile(theirs, mine)
+                shutil.copy2(theirs, mine)
         for part in ("gsdmsr_cli", "tests"):
             for path in (self.folder / part).rglob("*.*"):
                 name = path.relative_to(self.folder).as_posix()

@@ -537,6 +537,17 @@ def test_control_points_follow_splats_that_have_changed_since() -> None:
     assert torch.equal(moved_by(motion, splats, 0.3).means, expected.means)
 
 
+@torch.no_grad()
+def test_control_points_follow_splats_that_have_changed_in_place() -> None:
+    """As an optimiser changes them: at the same address, of the same number."""
+    splats, motion = splats_of(COUNT), disturbed(started("control_points"))
+    moved_by(motion, splats, 0.3)
+    splats.means.neg_()
+    motion.advance(1.0)
+    expected = moved_by(disturbed(started("control_points")), splats, 0.3)
+    assert_equal(moved_by(motion, splats, 0.3), expected)
+
+
 @pytest.mark.parametrize(
     ("options", "found"),
     [({"count": 3}, "count is 3; allowed: 4 or more"), ({"neighbours": 2000}, "1 to count")],
