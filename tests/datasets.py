@@ -54,6 +54,20 @@ def dnerf_frames(split: str, count: int) -> list[dict[str, Any]]:
     ]
 
 
+def write_colmap(folder: Path, names: list[str], camera: str = "1 PINHOLE 10 8 9 9 5 4") -> Path:
+    """Write a COLMAP model as text, with pictures of 10 x 8 px of those names that are plain."""
+    model = folder / "sparse" / "0"
+    model.mkdir(parents=True)
+    (model / "cameras.txt").write_text(f"{camera}\n")
+    lines = [f"{i} 1 0 0 0 {0.1 * i} 0 4 1 {name}\n\n" for i, name in enumerate(names)]
+    (model / "images.txt").write_text("".join(lines))
+    (model / "points3D.txt").write_text("1 0 0 0 255 128 0 0.5 1 2\n")
+    for name in names:
+        if "/" not in name and len(name) < 100:
+            write_picture(folder / "images" / name, noise(8, 10, 3))
+    return folder
+
+
 def write_dnerf(folder: Path, train: int = 3, val: int = 2, test: int = 2) -> Path:
     """Write a D-NeRF data set of 10 x 8 px RGBA pictures and return its folder."""
     for split, count in (("train", train), ("val", val), ("test", test)):

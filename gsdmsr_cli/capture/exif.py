@@ -10,7 +10,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from gsdmsr_cli.ground.errors import DataError
 from gsdmsr_cli.scene.native import OpenImageIO
+from gsdmsr_cli.scene.picture_files import IN_CAPTURES, opened
 
 FULL_FRAME_DIAGONAL = math.hypot(36, 24)
 """Of the film that "35 mm equivalent" focal lengths refer to [mm]."""
@@ -33,12 +35,11 @@ class ExifTags:
 
 def read_exif(path: Path) -> ExifTags:
     """Return the tags of a picture, empty where it has none or cannot be read."""
-    source = OpenImageIO.ImageInput.open(str(path))
-    if source is None:
-        OpenImageIO.geterror()  # clear it: decoding the pixels will show
+    try:
+        with opened(path, IN_CAPTURES) as source:
+            spec = source.spec()
+    except DataError:  # decoding the pixels will show
         return ExifTags()
-    spec = source.spec()
-    source.close()
     orientation = spec.getattribute("Orientation") or 1
     return ExifTags(
         orientation if orientation in range(1, 9) else 1,

@@ -20,6 +20,7 @@ from gsdmsr_cli.ground.files import read_json, write_json
 from gsdmsr_cli.ground.progress import OnProgress
 from gsdmsr_cli.scene.imaging import read_image, write_png
 from gsdmsr_cli.scene.native import cv2
+from gsdmsr_cli.scene.picture_files import IN_CAPTURES
 from gsdmsr_cli.scene.video import read_video, video_length
 
 Picture = NDArray[np.uint8]
@@ -215,7 +216,7 @@ def _survey_pictures(source: Source, count: int, on_progress: OnProgress) -> _Su
     order = np.argsort(times, kind="stable")
     files = [source.files[i] for i in order]
     with ThreadPoolExecutor() as pool:
-        sharpnesses = pool.map(lambda path: sharpness(_rgb(read_image(path))), files)
+        sharpnesses = pool.map(lambda path: sharpness(_rgb(read_image(path, IN_CAPTURES))), files)
         candidates = []
         for i, sharp in zip(order, sharpnesses, strict=True):
             time = times[i] - min(times)
@@ -249,7 +250,7 @@ def _pictures(
     paths = {path.name: path for path in source.files}
     if source.kind == "images":
         for frame in taken:
-            picture = _rgb(read_image(paths[frame.file]))
+            picture = _rgb(read_image(paths[frame.file], IN_CAPTURES))
             yield upright(picture, tags[frame.file].orientation)
         return
     for name, path in paths.items():

@@ -18,6 +18,7 @@ from gsdmsr_cli.ground.files import write_json
 from gsdmsr_cli.ground.progress import OnProgress
 from gsdmsr_cli.scene.imaging import read_image, write_png
 from gsdmsr_cli.scene.native import cv2
+from gsdmsr_cli.scene.picture_files import IN_CAPTURES
 
 Mask = NDArray[np.bool_]
 
@@ -105,7 +106,7 @@ def _wanted(frames: Frames, frame: Candidate) -> str:
 
 def _read(path: Path, inverted: bool, frames: Frames, original: Path) -> Mask:
     """Return a mask in the frames' size, (H, W)."""
-    picture = read_image(path)
+    picture = read_image(path, IN_CAPTURES)
     if frames.of_pictures:
         picture = upright(picture, read_exif(original).orientation)
     height, width, channels = picture.shape

@@ -28,6 +28,7 @@ from gsdmsr_cli.cli import (
 from gsdmsr_cli.cli import eval as evaluate
 from gsdmsr_cli.ground import origin
 from gsdmsr_cli.ground.errors import DataError, GsdmsrError, UsageError
+from gsdmsr_cli.ground.printing import is_printable, one_line
 from gsdmsr_cli.ground.streams import unfailing
 
 # These files import gsdmsr_cli.commands in the functions that run them: torch alone would make
@@ -97,6 +98,7 @@ def _run() -> int:
 
 def _call() -> int:
     try:
+        _require_printable(sys.argv[1:])
         with ctrl_c_that_spares_imports():
             result = typer.main.get_command(app).main(prog_name="gsdmsr", standalone_mode=False)
     except (KeyboardInterrupt, typer.Abort):
@@ -111,7 +113,17 @@ def _call() -> int:
 
 
 def _tell(message: str) -> None:
-    typer.echo(f"error: {' '.join(message.split())}", err=True)
+    typer.echo(f"error: {one_line(message)}", err=True)
+
+
+def _require_printable(arguments: list[str]) -> None:
+    """Raise UsageError if an argument would steer a terminal or is not text: names are printed."""
+    for argument in arguments:
+        if not is_printable(argument.translate({9: " ", 10: " ", 13: " "})):
+            raise UsageError(
+                f"{argument}: this argument has control characters or is not UTF-8; rename the "
+                "file or give another path to it"
+            )
 
 
 @contextmanager

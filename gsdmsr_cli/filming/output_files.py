@@ -23,6 +23,7 @@ from gsdmsr_cli.scene.film import Shot
 from gsdmsr_cli.scene.imaging import image_size
 
 SCHEMA = 1
+_KINDS = ("png", "openexr")
 _FRAME = re.compile(r"\d{4,}\.(?:png|exr)")
 
 
@@ -78,7 +79,7 @@ class OutputFiles:
         """Return whether all files of a frame are there, whole."""
         files = [path for path in (self.png(index), self.exr(index)) if path is not None]
         try:
-            return all(path.is_file() and image_size(path) == self.size for path in files)
+            return all(path.is_file() and image_size(path, _KINDS) == self.size for path in files)
         except DataError:
             return False
 

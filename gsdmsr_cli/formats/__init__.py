@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 
 from gsdmsr_cli.formats._suited import Suited, suited_preset
 from gsdmsr_cli.ground import plugins
 from gsdmsr_cli.ground.errors import DataError
+from gsdmsr_cli.ground.printing import printable
 from gsdmsr_cli.ground.progress import OnProgress
 from gsdmsr_cli.scene.scene import Scene
 
@@ -52,7 +54,8 @@ def _read(folder: Path, on_progress: OnProgress) -> Scene:
             if hasattr(module, "prepare"):
                 module.prepare(folder, on_progress)
             scene: Scene = module.read(folder)
-            return scene
+            views = tuple(replace(view, name=printable(view.name)) for view in scene.views)
+            return replace(scene, views=views)
     known = "; ".join(f"{name} ({module.SIGN})" for name, module in formats)
     raise DataError(
         f"data folder {folder} has no known layout; found {_listing(folder)}; known: {known}"

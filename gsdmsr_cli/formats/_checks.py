@@ -7,6 +7,7 @@ import json
 import math
 from collections.abc import Iterable, Sequence
 from pathlib import Path, PurePosixPath, PureWindowsPath
+from reprlib import Repr
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,9 @@ from gsdmsr_cli.scene.scene import View
 
 EXTENSIONS = (".png", ".jpg", ".jpeg")
 """Tried in turn after a picture's path that names no file as it stands."""
+
+MOST_PIXELS = 1_000_000
+"""Longest side that a camera's picture may be said to have; the files may be shrunk ones."""
 
 RIGID_TOLERANCE = 1e-3
 """Largest deviation of R^T R from the identity in a pose."""
@@ -43,14 +47,14 @@ def read_json(path: Path) -> dict[str, Any]:
 def mapping(value: object, where: str) -> dict[str, Any]:
     """Return ``value`` if it is a JSON object, else raise DataError."""
     if not isinstance(value, dict):
-        raise DataError(f"{where}: {_shown(value)} found where a JSON object {{...}} must stand")
+        raise DataError(f"{where}: {shown(value)} found where a JSON object {{...}} must stand")
     return value
 
 
 def sequence(value: object, where: str) -> list[Any]:
     """Return ``value`` if it is a JSON list, else raise DataError."""
     if not isinstance(value, list):
-        raise DataError(f"{where}: {_shown(value)} found where a JSON list [...] must stand")
+        raise DataError(f"{where}: {shown(value)} found where a JSON list [...] must stand")
     return value
 
 
@@ -63,7 +67,7 @@ def number(value: object, where: str) -> float:
             result = math.inf
         if math.isfinite(result):
             return result
-    raise DataError(f"{where} is {_shown(value)}; it must be a finite number")
+    raise DataError(f"{where} is {shown(value)}; it must be a finite number")
 
 
 def positive(value: object, where: str) -> float:
@@ -77,8 +81,10 @@ def positive(value: object, where: str) -> float:
 def pixels(value: object, where: str) -> int:
     """Return ``value`` if it is a whole number above 0, else raise DataError."""
     result = number(value, where)
-    if result < 1 or result != int(result):
-        raise DataError(f"{where} is {result}; it must be a whole number of pixels")
+    if not 1 <= result <= MOST_PIXELS or result != int(result):
+        raise DataError(
+            f"{where} is {result:g}; it must be a whole number of pixels, 1 to {MOST_PIXELS}"
+        )
     return int(result)
 
 
@@ -126,13 +132,19 @@ def rigid_pose(value: object, where: str) -> NDArray[np.float64]:
     return pose
 
 
-def picture_path(root: Path, text: object, where: str) -> Path:
+def picture_path(root: Path, text: object, where: str, within: Path | None = None) -> Path:
     """Return the picture that ``text`` names relative to ``root``, whose extension may be missing.
 
+    Args:
+        root: folder that ``text`` is relative to.
+        text: as the file has it.
+        where: place in the file, for messages.
+        within: folder that ``root`` must not lead out of by a link.
+
     Raises:
-        DataError: it names nothing, or something outside of ``root``.
+        DataError: it names nothing, or something outside of ``root`` or ``within``.
     """
-    path = _inner_path(root, text, where, ("", *EXTENSIONS))
+    path = _inner_path(root, text, where, ("", *EXTENSIONS), within)
     if path is None:
         raise DataError(
             f"{where}: image {root / _relative(root, text, where)} does not exist, nor with "
@@ -147,7 +159,7 @@ def inner_path(root: Path, text: object, where: str) -> Path:
     Raises:
         DataError: it names nothing, or something outside of ``root``.
     """
-    path = _inner_path(root, text, where, ("",))
+    path = path_if_there(root, text, where)
     if path is None:
         raise DataError(
             f"{where}: {root / _relative(root, text, where)} does not exist; restore it"
@@ -155,29 +167,42 @@ def inner_path(root: Path, text: object, where: str) -> Path:
     return path
 
 
-def _inner_path(root: Path, text: object, where: str, extensions: tuple[str, ...]) -> Path | None:
+def path_if_there(root: Path, text: object, where: str, within: Path | None = None) -> Path | None:
+    """Return the file that ``text`` names relative to ``root``, None if there is no such file.
+
+    Raises:
+        DataError: it is no name, or leads out, see ``picture_path``.
+    """
+    return _inner_path(root, text, where, ("",), within)
+
+
+def _inner_path(
+    root: Path, text: object, where: str, extensions: tuple[str, ...], within: Path | None
+) -> Path | None:
     relative = _relative(root, text, where)
+    limits = [root] if within is None else [root, within]
     try:
-        inside = root.resolve()
         for extension in extensions:
             path = root / (relative + extension)
-            if not path.resolve().is_relative_to(inside):
-                raise DataError(
-                    f"{where} is {_shown(text)}, which leads out of {root}; put the file inside"
-                )
+            real = path.resolve()
+            for limit in limits:
+                if not real.is_relative_to(limit.resolve()):
+                    raise DataError(
+                        f"{where} is {shown(text)}, which leads out of {limit}; put the file inside"
+                    )
             if path.is_file():
                 return path
     except (OSError, ValueError, RuntimeError) as error:  # Too long, a null byte, a loop of links.
-        raise DataError(f"{where} is {_shown(text)}, which is not a usable path") from error
+        raise DataError(f"{where} is {shown(text)}, which is not a usable path") from error
     return None
 
 
 def _relative(root: Path, text: object, where: str) -> str:
     if not isinstance(text, str) or not text.strip():
-        raise DataError(f"{where} is {_shown(text)}; it must name a file")
+        raise DataError(f"{where} is {shown(text)}; it must name a file")
     relative = text.replace("\\", "/")
     if PurePosixPath(relative).is_absolute() or PureWindowsPath(relative).drive:
-        raise DataError(f"{where} is {_shown(text)}; it must be relative to {root}")
+        raise DataError(f"{where} is {shown(text)}; it must be relative to {root}")
     return relative
 
 
@@ -239,6 +264,11 @@ def fingerprint(paths: Iterable[Path]) -> str:
     return digest.hexdigest()[:16]
 
 
-def _shown(value: object) -> str:
-    text = repr(value)
+def shown(value: object) -> str:
+    """Return what a file holds in a form for messages, short and whatever it is."""
+    text = _SHORT.repr(value)
     return text if len(text) <= 60 else f"{text[:57]}..."
+
+
+_SHORT = Repr()
+_SHORT.maxlevel, _SHORT.maxstring, _SHORT.maxother = 3, 60, 60

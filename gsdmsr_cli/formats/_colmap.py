@@ -16,6 +16,7 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from gsdmsr_cli.formats._checks import MOST_PIXELS
 from gsdmsr_cli.ground.errors import DataError
 from gsdmsr_cli.scene.lens import Lens
 
@@ -98,17 +99,22 @@ def _whole(parse: Callable[[Path], Iterator[T]], path: Path) -> list[T]:
     except OSError as error:
         raise DataError(f"{path} cannot be read: {error.strerror or error}") from error
     except (ValueError, IndexError, OverflowError, struct.error) as error:
-        raise DataError(f"{path}: is damaged: {error}; export the model again") from error
+        raise DataError(f"{path}: is damaged: {_brief(error)}; export the model again") from error
+
+
+def _brief(error: Exception) -> str:
+    return f"{error}"[:300]
 
 
 def _lens(model: str, width: int, height: int, parameters: list[float]) -> Lens:
     """Return the lens of a camera; what models have in common is their order of parameters."""
     if len(parameters) != _COUNTS[model]:
         raise ValueError(f"{model} with {len(parameters)} parameters, not {_COUNTS[model]}")
-    if not np.isfinite(parameters).all() or min(width, height) < 1 or parameters[0] <= 0:
-        raise ValueError(f"a camera of {width} x {height} px with the parameters {parameters}")
     square = model.startswith(("SIMPLE", "RADIAL"))  # one focal length
     fx, fy, cx, cy, *terms = [*parameters[:1], *parameters] if square else parameters
+    sizes = min(width, height) >= 1 and max(width, height) <= MOST_PIXELS
+    if not (sizes and np.isfinite(parameters).all() and min(fx, fy) > 0):
+        raise ValueError(f"a camera of {width} x {height} px with the parameters {parameters}")
     fisheye = model.endswith("FISHEYE")
     tangential = (0.0, 0.0)
     if model in ("OPENCV", "FULL_OPENCV"):
@@ -159,12 +165,19 @@ def _images(path: Path) -> Iterator[Image]:
         numbers = struct.unpack_from("<7d", data, at + 4)
         (camera,) = struct.unpack_from("<i", data, at + 60)
         end = data.index(b"\0", at + 64)
-        name = data[at + 64 : end].decode()
+        name = _name(data[at + 64 : end])
         (observations,) = struct.unpack_from("<Q", data, end + 1)
         at = end + 9 + 24 * observations
         yield Image(name, _pose(numbers), camera)
     if at > len(data):
         raise ValueError("it ends too early")
+
+
+def _name(text: bytes) -> str:
+    try:
+        return text.decode()
+    except UnicodeDecodeError:
+        raise ValueError(f"the name of an image is {text[:60]!r}, which is not UTF-8") from None
 
 
 def _points(path: Path) -> Iterator[Floats]:
@@ -216,4 +229,6 @@ def _points_text(path: Path) -> Iterator[Floats]:
     for line in _lines(path):
         if words := line.split():
             x, y, z, red, green, blue = map(float, words[1:7])
+            if not 0 <= min(red, green, blue) <= max(red, green, blue) <= 255:
+                raise ValueError(f"a point has the colour {red:g} {green:g} {blue:g}")
             yield np.array([[x, y, z, red, green, blue]])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,8 +38,13 @@ def read_ply(path: Path) -> Points:
     points = np.stack([rows[axis].astype(np.float64) for axis in "xyz"], axis=1)
     if not {"red", "green", "blue"} <= names:
         return uncoloured(points)
-    channels = [rows[name] for name in ("red", "green", "blue")]
-    full = 1.0 if np.issubdtype(channels[0].dtype, np.floating) else 255.0
-    colours = np.stack(channels, axis=1).astype(np.float32) / np.float32(full)
-    finite = np.isfinite(points).all(axis=1)
+    channels = [_channel(rows[name]) for name in ("red", "green", "blue")]
+    colours = np.stack(channels, axis=1)
+    finite = np.isfinite(points).all(axis=1) & np.isfinite(colours).all(axis=1)
     return points[finite], colours[finite]
+
+
+def _channel(values: NDArray[Any]) -> NDArray[np.float32]:
+    """Return one channel of colours, (P,); whole numbers count up to 255, others up to 1."""
+    full = 1.0 if np.issubdtype(values.dtype, np.floating) else 255.0
+    return np.clip(values / np.float32(full), 0, 1).astype(np.float32)

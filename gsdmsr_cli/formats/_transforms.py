@@ -104,7 +104,8 @@ def _distortion(
         return (), (0.0, 0.0), False
     if model not in _BROWN:
         known = ", ".join((*_PINHOLES, *_BROWN, _FISHEYE))
-        raise DataError(f"{where}: camera_model is {model!r:.60}; it must be one of {known}")
+        found = checks.shown(model)
+        raise DataError(f"{where}: camera_model is {found}; it must be one of {known}")
     if k4:
         raise DataError(f"{where}: k4 is {k4}; it must be 0 but for {_FISHEYE}: undistort first")
     return (k1, k2, k3), (p1, p2), False

@@ -23,6 +23,9 @@ PICTURES = ("images", "input", "rgb", "colmap/images", ".")
 TEST_EVERY = 8
 """Every 8th picture by name, from the first on, is for testing (Mip-NeRF 360, 3DGS)."""
 
+_DIGITS = 30
+"""Longer numbers in names are no times."""
+
 _OTHERS = (
     "transforms.json", "transforms_train.json", "dataset.json", "train_meta.json", "cam*.mp4",
     "cam*/images",
@@ -48,10 +51,10 @@ def read(folder: Path) -> Scene:
     images = model.images
     if not images:
         raise DataError(f"{model_folder}: no registered images; at least one is needed")
-    pictures = _picture_folder(folder, images[0].name)
+    pictures = _picture_folder(folder, images[0].name, f"{model.files[1]}")
     times = times_by_name([image.name for image in images])
     views = [
-        _read_view(pictures, image, model, time, _split(i, len(images)))
+        _read_view(folder, pictures, image, model, time, _split(i, len(images)))
         for i, (image, time) in enumerate(zip(images, times, strict=True))
     ]
     checks.one_size(views)
@@ -74,12 +77,12 @@ def _model_folder(folder: Path) -> Path | None:
     return next((folder / m for m in MODELS if _colmap.is_model(folder / m)), None)
 
 
-def _picture_folder(folder: Path, first: str) -> Path:
+def _picture_folder(folder: Path, first: str, where: str) -> Path:
     for name in PICTURES:
-        if (folder / name / first).is_file():
+        if checks.path_if_there(folder / name, first, f"{where}: a name", within=folder):
             return folder / name
     raise DataError(
-        f"{folder}: image '{first}' of its COLMAP model is in none of {', '.join(PICTURES)}"
+        f"{folder}: image '{first:.60}' of its COLMAP model is in none of {', '.join(PICTURES)}"
     )
 
 
@@ -89,7 +92,7 @@ def times_by_name(names: list[str]) -> list[float]:
     So pictures of several cameras may share their times: ``left/0007.png`` and ``right/0007.png``.
     """
     found = [re.findall(r"\d+", Path(name).stem) for name in names]
-    moments = [int(numbers[-1]) for numbers in found if numbers]
+    moments = [int(numbers[-1]) for numbers in found if numbers and len(numbers[-1]) <= _DIGITS]
     if len(moments) < len(names) or len(set(moments)) < 2:
         moments = list(range(len(names)))
     first, last = min(moments), max(moments)
@@ -101,12 +104,17 @@ def _split(i: int, count: int) -> str:
 
 
 def _read_view(
-    pictures: Path, image: _colmap.Image, model: _colmap.ColmapModel, time: float, split: str
+    folder: Path,
+    pictures: Path,
+    image: _colmap.Image,
+    model: _colmap.ColmapModel,
+    time: float,
+    split: str,
 ) -> View:
     where = f"{model.files[1]}: '{image.name:.60}'"
     if image.camera not in model.cameras:
         raise DataError(f"{where}: camera {image.camera} is not in {model.files[0]}")
-    path = checks.picture_path(pictures, image.name, where)
+    path = checks.picture_path(pictures, image.name, where, within=folder)
     size, lens = image_size(path), model.cameras[image.camera]
     checks.same_shape((lens.width, lens.height), size, path)
     lens = lens.resized(*size)

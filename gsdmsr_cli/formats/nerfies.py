@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from gsdmsr_cli.formats import _checks as checks
 from gsdmsr_cli.formats import _points, _world
+from gsdmsr_cli.formats._arrays import read_npy
 from gsdmsr_cli.ground.errors import DataError
 from gsdmsr_cli.scene.imaging import image_size
 from gsdmsr_cli.scene.lens import Lens
@@ -54,7 +55,7 @@ def read(folder: Path) -> Scene:
     points, colours = _read_points(folder / "points.npy")
     world = _world.normalize(views, points, _depths(folder / "scene.json"))
     files = [folder / name for name in ("dataset.json", "metadata.json", "scene.json")]
-    cameras = [_camera_path(folder, name) for name in splits]
+    cameras = [folder / _camera(name) for name in splits]
     return Scene(
         root=folder,
         layout="nerfies",
@@ -88,7 +89,8 @@ def _names(document: dict[str, Any], key: str, path: Path) -> list[str]:
     names = checks.sequence(document.get(key, []), f"{path}: {key}")
     for name in names:
         if not isinstance(name, str):
-            raise DataError(f"{path}: {key}: {name!r:.60} found where a frame's name must stand")
+            found = checks.shown(name)
+            raise DataError(f"{path}: {key}: {found} found where a frame's name must stand")
     return names
 
 
@@ -116,12 +118,12 @@ def _picture_folder(folder: Path) -> str:
     raise DataError(f"{folder}: no pictures; looked for {', '.join(f'rgb/{s}' for s in SCALES)}")
 
 
-def _camera_path(folder: Path, name: str) -> Path:
-    return folder / "camera" / f"{name}.json"
+def _camera(name: str) -> str:
+    return f"camera/{name}.json"
 
 
 def _read_view(folder: Path, pictures: str, name: str, time: float, split: str) -> View:
-    path = _camera_path(folder, name)
+    path = checks.inner_path(folder, _camera(name), f"{folder}: frame '{name:.60}'")
     image_path = checks.picture_path(folder, f"{pictures}/{name}", f"{path}: frame '{name:.60}'")
     fields = checks.read_json(path)
     lens = _lens(fields, path)
@@ -176,13 +178,10 @@ def _read_points(path: Path) -> _points.Points:
     """Return the points of the capture, none if there is no such file."""
     if not path.is_file():
         return _points.none()
-    try:
-        points = np.load(path, allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
-        raise DataError(f"{path}: is damaged or holds no numbers: {error}") from error
-    if points.ndim != 2 or points.shape[1] != 3 or not np.issubdtype(points.dtype, np.number):
+    points = read_npy(path)
+    if points.ndim != 2 or points.shape[1] != 3:
         raise DataError(f"{path}: has shape {points.shape}; it must hold (P, 3) numbers")
-    return _points.uncoloured(points.astype(np.float64))
+    return _points.uncoloured(points)
 
 
 def _depths(path: Path) -> tuple[float, float] | None:

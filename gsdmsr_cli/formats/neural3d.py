@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from gsdmsr_cli.formats import _checks as checks
 from gsdmsr_cli.formats import _world
+from gsdmsr_cli.formats._arrays import read_npy
 from gsdmsr_cli.ground.errors import DataError
 from gsdmsr_cli.ground.progress import OnProgress
 from gsdmsr_cli.scene.camera import Camera
@@ -144,17 +145,14 @@ def _halved(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 def _rows(path: Path, cameras: int) -> NDArray[np.float64]:
     """Return LLFF's (cameras, 17) numbers: 3 x 5 of pose and size, nearest and farthest depth."""
-    try:
-        rows = np.load(path, allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
-        raise DataError(f"{path}: is damaged or holds no numbers: {error}") from error
-    if rows.ndim != 2 or rows.shape[1] != 17 or not np.issubdtype(rows.dtype, np.number):
+    rows = read_npy(path)
+    if rows.ndim != 2 or rows.shape[1] != 17:
         raise DataError(f"{path}: has shape {rows.shape}; it must hold (cameras, 17) numbers")
     if len(rows) != cameras:
         raise DataError(f"{path}: has {len(rows)} poses, but there are {cameras} cameras")
     if not (np.isfinite(rows).all() and (rows[:, 15:] > 0).all()):
         raise DataError(f"{path}: holds NaN, infinity or a depth that is not above 0")
-    return np.asarray(rows, dtype=np.float64)
+    return rows
 
 
 def _camera(row: NDArray[np.float64], picture: Path, where: str) -> Camera:

@@ -9,12 +9,12 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
 from typing import Any
-from zipfile import BadZipFile
 
 import numpy as np
 
 from gsdmsr_cli.formats import _checks as checks
 from gsdmsr_cli.formats import _points, _world
+from gsdmsr_cli.formats._arrays import read_npz
 from gsdmsr_cli.ground.errors import DataError
 from gsdmsr_cli.scene.camera import Camera
 from gsdmsr_cli.scene.imaging import image_size
@@ -82,7 +82,7 @@ def _read_split(folder: Path, split: str, path: Path) -> list[View]:
 def _read_view(
     folder: Path, split: str, time: float, name: Any, matrix: Any, pose: Any, size: Any, where: str
 ) -> View:
-    image = checks.picture_path(folder / "ims", name, f"{where}: fn")
+    image = checks.picture_path(folder / "ims", name, f"{where}: fn", within=folder)
     rows = [checks.numbers(row, 3, f"{where}: k") for row in checks.sequence(matrix, f"{where}: k")]
     if len(rows) != 3:
         raise DataError(f"{where}: k is not 3 x 3 numbers")
@@ -104,8 +104,9 @@ def _read_view(
         split=split,
         image_path=image,
     )
-    mask = folder / "seg" / PurePosixPath(name).with_suffix(".png")
-    if not mask.is_file():
+    mask_name = str(PurePosixPath(name).with_suffix(".png"))
+    mask = checks.path_if_there(folder / "seg", mask_name, f"{where}: fn", within=folder)
+    if mask is None:
         return view
     checks.mask_size(mask, image_size(mask), view)
     return replace(view, signals={MOVING: mask})
@@ -114,11 +115,7 @@ def _read_view(
 def _read_points(path: Path) -> _points.Points:
     if not path.is_file():
         return _points.none()
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            table = np.asarray(archive["data"], dtype=np.float64)
-    except (OSError, ValueError, EOFError, KeyError, BadZipFile) as error:
-        raise DataError(f"{path}: is damaged or has no 'data' of numbers: {error}") from error
+    table = read_npz(path, "data")
     if table.ndim != 2 or table.shape[1] < 6:
         raise DataError(f"{path}: its data has shape {table.shape}; it must be (P, 6) or wider")
     table = table[np.isfinite(table).all(axis=1)]

@@ -5,11 +5,16 @@ from __future__ import annotations
 import difflib
 from collections.abc import Iterable
 
+from gsdmsr_cli.ground.printing import one_line
+
 
 class GsdmsrError(Exception):
     """An error whose message is one line: what was found, what is allowed and what to do."""
 
     exit_code = 1
+
+    def __str__(self) -> str:
+        return one_line(super().__str__())
 
 
 class UsageError(GsdmsrError):

@@ -33,6 +33,10 @@ class _Loader(yaml.SafeLoader):  # type: ignore[misc]
         return super().compose_node(parent, index)
 
 
+_KINDS = "null", "bool", "int", "float", "str", "seq", "map"
+_TAGS = {f"tag:yaml.org,2002:{kind}" for kind in _KINDS}
+"""Kinds of values that options have; a file may name others."""
+
 _FLOAT = r"[-+]?(\.[0-9]+|[0-9]+\.[0-9]*)([eE][-+]?[0-9]+)?|[-+]?[0-9]+[eE][-+]?[0-9]+"
 for _tag, _pattern, _first in [
     ("null", r"~|null|Null|NULL|", ["~", "n", "N", ""]),
@@ -203,13 +207,16 @@ def _parse(text: str, place: Place, source: str) -> Any:
 
 
 def _value(loader: _Loader, node: yaml.Node, place: Place) -> Any:
+    if node.tag not in _TAGS:
+        where = place(node.start_mark.line + 1)
+        raise UsageError(f"{where}: the tag '{node.tag:.60}' is not allowed; drop it")
     if isinstance(node, yaml.SequenceNode):
         return [_value(loader, item, place) for item in node.value]
     if isinstance(node, yaml.MappingNode):
         return _mapping(loader, node, place)
     try:
         return loader.construct_object(node)
-    except ValueError as error:
+    except (ValueError, LookupError) as error:  # as of !!bool x, and of very long numbers
         where = place(node.start_mark.line + 1)
         raise UsageError(f"{where}: '{node.value[:40]}' cannot be read: {error}") from None
 

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import struct
-import zlib
 from pathlib import Path
 
 import numpy as np
@@ -13,8 +10,8 @@ from numpy.typing import NDArray
 from gsdmsr_cli.ground.errors import DataError, GsdmsrError
 from gsdmsr_cli.ground.files import replacing
 from gsdmsr_cli.scene.native import OpenImageIO, cv2
+from gsdmsr_cli.scene.picture_files import IN_SCENES, opened, unreadable
 
-_PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _PNG_SETTINGS = (
     cv2.IMWRITE_PNG_COMPRESSION, 1,
     cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_UP,
@@ -22,40 +19,39 @@ _PNG_SETTINGS = (
 )  # fmt: skip
 
 
-def read_image(path: Path) -> NDArray[np.uint8]:
+def read_image(path: Path, kinds: tuple[str, ...] = IN_SCENES) -> NDArray[np.uint8]:
     """Return the pixels of ``path``, (H, W, C) with C = 1 (grey), 3 (RGB) or 4 (RGBA).
 
     Alpha is straight (unassociated), exactly as stored; 16-bit files are scaled to 8 bits. Grey
     with alpha becomes RGBA. An orientation tag is ignored: cameras refer to pixels as stored.
 
+    Args:
+        path: of the file, whose content decides what it is, not its name.
+        kinds: of files that are taken, see ``picture_files``.
+
     Raises:
-        DataError: the file is missing, truncated, damaged or not a picture.
+        DataError: the file is missing, truncated, damaged, not such a picture, or too large.
     """
-    source = _open(path, thorough=True)
-    pixels = source.read_image(OpenImageIO.UINT8)
-    # A truncated JPEG decodes with its missing rows in grey and says so only in the error text.
-    message = source.geterror()
-    source.close()
+    with opened(path, kinds, thorough=True) as source:
+        pixels = source.read_image(OpenImageIO.UINT8)
+        # A truncated JPEG decodes with its missing rows in grey and says so only in the error text.
+        message = source.geterror()
     if pixels is None or message:
-        raise DataError(_unreadable(path, message))
-    channels = pixels.shape[2]
-    if channels == 2:
+        raise DataError(unreadable(path, message))
+    if pixels.shape[2] == 2:
         pixels = pixels[..., [0, 0, 0, 1]]
-    elif channels > 4:
-        raise DataError(f"image {path} has {channels} channels; allowed are grey, RGB and RGBA")
     return np.ascontiguousarray(pixels)
 
 
-def image_size(path: Path) -> tuple[int, int]:
-    """Return (width, height) [px] of ``path`` without decoding its pixels.
+def image_size(path: Path, kinds: tuple[str, ...] = IN_SCENES) -> tuple[int, int]:
+    """Return (width, height) [px] of ``path`` without decoding its pixels; ``kinds`` as above.
 
     Raises:
-        DataError: the file is missing or has no readable header, or is a PNG without an end.
+        DataError: the file is missing, no such picture, too large, or is a PNG without an end.
     """
-    source = _open(path)
-    spec = source.spec()
-    source.close()
-    return spec.width, spec.height
+    with opened(path, kinds) as source:
+        spec = source.spec()
+        return spec.width, spec.height
 
 
 def write_png(path: Path, image: NDArray[np.uint8]) -> None:
@@ -106,12 +102,11 @@ def read_exr(path: Path) -> tuple[NDArray[np.float32], tuple[str, ...]]:
     Raises:
         DataError: the file is missing or damaged.
     """
-    source = _open(path)
-    spec, pixels = source.spec(), source.read_image(OpenImageIO.FLOAT)
-    message = source.geterror()
-    source.close()
+    with opened(path, ("openexr",)) as source:
+        spec, pixels = source.spec(), source.read_image(OpenImageIO.FLOAT)
+        message = source.geterror()
     if pixels is None or message:
-        raise DataError(_unreadable(path, message))
+        raise DataError(unreadable(path, message))
     return pixels, tuple(spec.channelnames)
 
 
@@ -199,50 +194,3 @@ def resample(
     how = cv2.INTER_CUBIC if sharply else cv2.INTER_LINEAR
     taken = cv2.remap(image, columns, rows, how, borderMode=cv2.BORDER_REPLICATE)
     return np.asarray(taken, dtype=np.float32)
-
-
-def _open(path: Path, thorough: bool = False) -> OpenImageIO.ImageInput:
-    try:
-        if not path.is_file():
-            raise DataError(f"image {path} does not exist or is not a file")
-        fault = _png_fault(path, thorough)
-    except OSError as error:
-        raise DataError(f"image {path} cannot be read: {error.strerror or error}") from error
-    if fault:
-        raise DataError(_unreadable(path, fault))
-    # Without this hint OpenImageIO premultiplies by alpha, in 8 bits.
-    config = OpenImageIO.ImageSpec()
-    config["oiio:UnassociatedAlpha"] = 1
-    source = OpenImageIO.ImageInput.open(str(path), config)
-    if source is None:
-        raise DataError(_unreadable(path, OpenImageIO.geterror()))
-    return source
-
-
-def _png_fault(path: Path, thorough: bool) -> str | None:
-    """Return what is wrong with a PNG's chunks: no end marker or, if thorough, a wrong checksum.
-
-    The decoder would notice too, but only with the pixels, and libpng then prints to stderr.
-    """
-    with path.open("rb") as file:
-        size = os.fstat(file.fileno()).st_size
-        if file.read(8) != _PNG_SIGNATURE:
-            return None
-        while len(header := file.read(8)) == 8:
-            length, kind = struct.unpack(">I4s", header)
-            if kind == b"IEND":
-                return None
-            end = file.tell() + length + 4
-            if end > size:
-                break
-            if thorough and zlib.crc32(kind + file.read(length)) != int.from_bytes(
-                file.read(4), "big"
-            ):
-                return "a checksum in the PNG is wrong"
-            file.seek(end)
-    return "the PNG ends too early"
-
-
-def _unreadable(path: Path, message: str) -> str:
-    reason = " ".join(message.split()) or "not a picture"
-    return f"image {path} is damaged or not a picture ({reason}); restore the file"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -73,14 +73,36 @@ def _read_header(path: Path, file: BinaryIO) -> tuple[str, np.dtype[np.void], in
 def _parsed(path: Path, text: bytes, dtype: np.dtype[np.void], count: int) -> NDArray[np.void]:
     """Return the vertices that are written out as decimal numbers."""
     names = dtype.names or ()
+    if len(text) + 1 < 2 * count * len(names):  # a digit and a space for each
+        raise _damaged(path, count, len(names))
     words = text.split(maxsplit=count * len(names))[: count * len(names)]
     try:
         numbers = np.array(words, dtype=np.float64).reshape(count, len(names))
     except ValueError as error:
-        raise DataError(
-            f"{path} is damaged or cut short: it does not hold {count} times {len(names)} numbers"
-        ) from error
+        raise _damaged(path, count, len(names)) from error
     rows = np.empty(count, dtype)
     for name, column in zip(names, numbers.T, strict=True):
-        rows[name] = column
+        rows[name] = _fitting(path, name, column, dtype[name])
     return rows
+
+
+def _fitting(
+    path: Path, name: str, column: NDArray[np.float64], kind: np.dtype[Any]
+) -> NDArray[np.float64]:
+    """Return the column if all of its numbers are of the property's type, else raise DataError."""
+    if kind.kind == "f":
+        return column
+    range_ = np.iinfo(kind)
+    wrong = ~((column >= range_.min) & (column <= range_.max))  # NaN is in no range
+    if wrong.any():
+        raise DataError(
+            f"{path}: vertex {wrong.argmax()} has {column[wrong][0]:g} as its {name}; allowed: "
+            f"{range_.min} to {range_.max}"
+        )
+    return column
+
+
+def _damaged(path: Path, count: int, columns: int) -> DataError:
+    return DataError(
+        f"{path} is damaged or cut short: it does not hold {count} times {columns} numbers"
+    )

@@ -14,6 +14,7 @@ import typer
 
 from gsdmsr_cli.ground.errors import DataError, GsdmsrError, ThresholdError, UsageError
 from gsdmsr_cli.ground.origin import version
+from gsdmsr_cli.ground.printing import is_printable, one_line
 
 Gsdmsr = Any  # the fixture of conftest.py
 
@@ -157,3 +158,31 @@ def test_debug_shows_the_traceback(
     error = capsys.readouterr().err
     assert "Traceback" in error
     assert error.splitlines()[-1].startswith("error: internal: ZeroDivisionError")
+
+
+@pytest.mark.parametrize(
+    ("name", "shown"),
+    [
+        ("a\x1b[31mb", r"a\x1b[31mb"),
+        ("a\u202eb", r"a\u202eb"),
+        ("a\udcff\udcfe", r"a\xff\xfe"),
+        ("a\x9b", r"a\x9b"),
+    ],
+)
+@pytest.mark.parametrize("command", ["train --data", "prepare", "eval", "render", "export"])
+def test_names_that_would_steer_a_terminal_are_refused_by_name(
+    gsdmsr: Gsdmsr, capsys: pytest.CaptureFixture[str], command: str, name: str, shown: str
+) -> None:
+    assert gsdmsr(f"{command} {name}") == 2
+    out, err = capsys.readouterr()
+    assert out == "" and err.startswith(f"error: {shown}: this argument has control characters")
+    assert err.count("\n") == 1 and err.strip().isprintable()
+
+
+def test_names_in_any_language_are_printable() -> None:
+    for name in ("böse Überraschung", "写真\u3000集", "a\u00a0b", "👩\u200d👩", "نام"):
+        assert is_printable(name) and one_line(name).split() == name.split()
+
+
+def test_an_error_is_one_printable_line_whatever_it_names() -> None:
+    assert str(DataError("a\nb: \x1b[2J\x07 is\r\n wrong")) == r"a b: \x1b[2J\x07 is wrong"

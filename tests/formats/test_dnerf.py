@@ -263,7 +263,7 @@ BAD: dict[str, tuple[Edit, str]] = {
     "focal zero": (lambda d: d.update(fl_x=0), "fl_x is 0.0; it must be above 0"),
     "centre a list": (lambda d: d.update(cx=[]), r"cx is \[\]"),
     "width half": (lambda d: d.update(w=10.5), "w is 10.5; it must be a whole number"),
-    "width zero": (lambda d: d.update(w=0), "w is 0.0; it must be a whole number"),
+    "width zero": (lambda d: d.update(w=0), "w is 0; it must be a whole number"),
     "other aspect": (lambda d: d.update(w=10, h=10), "10 x 8 px, but its camera's size is 10 x 10"),
     "distortion of another model": (lambda d: d.update(k4=0.1), r"k4 is 0\.1; it must be 0"),
     "a camera unknown": (

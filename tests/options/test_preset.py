@@ -153,8 +153,8 @@ def test_a_circle_of_bases_is_told(presets: Path) -> None:
         ("a: &x {b: 1}\ntraining: *x\n", 2, "aliases"),
         ("training: &x\n  steps: *x\n", 2, "aliases"),
         ("training: {}\ndata: {}\ntraining: {}\n", 3, "key 'training' stands twice"),
-        ("data:\n  downscale: !!python/object/apply:os.getcwd []\n", None, "downscale"),
-        ("data:\n  downscale: !!python/name:os.getcwd x\n", 2, "is not YAML"),
+        ("data:\n  downscale: !!python/object/apply:os.getcwd []\n", 2, "the tag"),
+        ("data:\n  downscale: !!python/name:os.getcwd x\n", 2, "the tag"),
         ("data:\n  downscale: !!int x\n", 2, "cannot be read"),
         ("1: 2\n", 1, "key 1 is not a name"),
         ("? [a]\n: 2\n", 1, "is not a name"),
@@ -188,6 +188,18 @@ def test_an_empty_config_changes_nothing(tmp_path: Path) -> None:
 @pytest.mark.parametrize("override", ["training.steps", "=3", "a..b=1", ".a=1", "a.=1", ""])
 def test_a_malformed_override_is_refused(override: str) -> None:
     assert refusal(None, None, override).startswith(f"--set {override}: allowed: a.b=value")
+
+
+@pytest.mark.parametrize(
+    "value",
+    [
+        "!!bool x", "!!int", "!!int ''", "!!float x", "!!timestamp x", "!!binary é", "!!set {a}",
+        "!!omap [a]", "!!null x", "!own x", "9" * 5000, "[" * 900 + "]" * 900,
+        "!!python/object/apply:os.getcwd []",
+    ],
+)  # fmt: skip
+def test_values_that_are_no_options_are_refused(value: str) -> None:
+    assert refusal(None, None, f"training.steps={value}").startswith("--set training.steps=")
 
 
 @pytest.mark.parametrize(

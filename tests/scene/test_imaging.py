@@ -14,6 +14,7 @@ from datasets import noise, write_picture
 
 from gsdmsr_cli.ground.errors import DataError
 from gsdmsr_cli.scene import imaging
+from gsdmsr_cli.scene.picture_files import IN_CAPTURES
 
 
 def assert_one_line(error: pytest.ExceptionInfo[DataError], path: Path) -> None:
@@ -119,7 +120,7 @@ def test_more_than_four_channels_are_refused(tmp_path: Path) -> None:
     out.write_image(noise(2, 3, 5))
     out.close()
     with pytest.raises(DataError, match="5 channels"):
-        imaging.read_image(path)
+        imaging.read_image(path, IN_CAPTURES)
 
 
 @pytest.mark.parametrize("name", ["a.png", "a.jpg"])
@@ -214,7 +215,7 @@ def test_exr_holds_the_numbers_exactly(tmp_path: Path, channels: tuple[str, ...]
     read, names = imaging.read_exr(tmp_path / "a.exr")
     assert names == channels and read.dtype == np.float32
     np.testing.assert_array_equal(read, image)
-    assert imaging.image_size(tmp_path / "a.exr") == (5, 7)
+    assert imaging.image_size(tmp_path / "a.exr", ("openexr",)) == (5, 7)
     assert [path.name for path in tmp_path.iterdir()] == ["a.exr"]
 
 
@@ -232,6 +233,7 @@ import resource, signal
 from pathlib import Path
 import numpy as np
 from gsdmsr_cli.scene import imaging
+from gsdmsr_cli.scene.picture_files import IN_CAPTURES
 from gsdmsr_cli.ground.errors import DataError
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 resource.setrlimit(resource.RLIMIT_FSIZE, (20000, 20000))
@@ -288,6 +290,7 @@ from pathlib import Path
 from gsdmsr_cli.scene.native import load_pycolmap
 load_pycolmap()
 from gsdmsr_cli.scene import imaging
+from gsdmsr_cli.scene.picture_files import IN_CAPTURES
 import numpy as np
 path = Path({str(tmp_path / "a.png")!r})
 imaging.write_png(path, np.zeros((64, 64, 4), np.uint8))
