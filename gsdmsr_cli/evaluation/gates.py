@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -163,7 +164,29 @@ def _read_report(path: Path) -> dict[str, Any]:
         raise DataError(f"{path}: is not a report of eval; give a metrics.json that it has written")
     if document.get("schema") != SCHEMA:
         raise DataError(f"{path}: has schema {document.get('schema')}; this version reads {SCHEMA}")
+    if not isinstance(document["protocol"].get("conventions", {}), dict):
+        raise DataError(f"{path}: damaged: its conventions are no JSON object")
+    for metric in METRICS:
+        _require_number(path, metric, document["aggregate"].get(metric))
+    if all(value_of(document["aggregate"], metric) is None for metric in METRICS):
+        raise DataError(f"{path}: has no number for any metric, so nothing is compared with it")
     return document
+
+
+def _require_number(path: Path, metric: str, entry: object) -> None:
+    """Raise DataError unless a report's entry of a metric is a finite number or has none."""
+    value = entry.get("value") if isinstance(entry, dict) else entry
+    if value is not None and not _is_finite(value):
+        found = repr(value)
+        found = found if len(found) <= 40 else f"{found[:40]} ..."
+        raise DataError(f"{path}: damaged: its {metric} is {found}; allowed: a number or null")
+
+
+def _is_finite(value: object) -> bool:
+    """Return whether a value is a number, of those that a float can have; a bool is none."""
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return False
+    return abs(value) <= sys.float_info.max
 
 
 def _shown(value: object) -> str:

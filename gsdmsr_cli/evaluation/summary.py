@@ -17,7 +17,7 @@ Document = Mapping[str, Any]
 def value_of(aggregate: Mapping[str, Any], metric: str) -> float | None:
     """Return the number that a report's aggregate has for a metric, or None."""
     entry = aggregate.get(metric)
-    value: float | None = entry["value"] if isinstance(entry, Mapping) else entry
+    value: float | None = entry.get("value") if isinstance(entry, Mapping) else entry
     return value
 
 

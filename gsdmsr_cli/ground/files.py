@@ -84,11 +84,18 @@ def read_json(path: Path) -> dict[str, Any]:
         DataError: the file cannot be read or is not a JSON object.
     """
     try:
-        document = json.loads(path.read_text(encoding="utf-8"))
+        text = path.read_text(encoding="utf-8")
+        document = json.loads(text, parse_constant=_refuse_constant)
     except OSError as error:
         raise DataError(f"{path}: cannot be read: {error.strerror or error}") from error
-    except (ValueError, RecursionError) as error:
+    except ValueError as error:
         raise DataError(f"{path}: damaged: {error}") from error
+    except RecursionError as error:
+        raise DataError(f"{path}: damaged: its lists or objects are nested too deeply") from error
     if not isinstance(document, dict):
         raise DataError(f"{path}: damaged: it holds no JSON object")
     return document
+
+
+def _refuse_constant(name: str) -> None:
+    raise ValueError(f"{name} is not a number that JSON has")

@@ -55,7 +55,7 @@ def test_what_has_no_value_passes_nothing(aggregate: dict[str, Any], tmp_path: P
     earlier = written(tmp_path / "a.json", report(psnr=1.0))
     (verdict,) = read_gates(Demands(baseline=earlier)).judge({"aggregate": aggregate})
     assert not verdict.passed and verdict.found == "psnr has no value here"
-    earlier = written(tmp_path / "a.json", report(**aggregate))
+    earlier = written(tmp_path / "a.json", report(**aggregate, ssim=0.5))
     gates = read_gates(Demands(baseline=earlier, tolerance=("psnr=100",)))
     (verdict,) = gates.judge(report(psnr=1e9))
     assert not verdict.passed and verdict.found == "psnr has no value in the baseline"
@@ -79,6 +79,45 @@ def test_with_tolerances_only_these_metrics_are_compared(tmp_path: Path) -> None
     for psnr, lpips, passed in ((24.6, 0.115, True), (24.4, 0.125, False)):
         verdicts = gates.judge(report(psnr=psnr, lpips_alex=distance(lpips), ssim=0.1))
         assert [verdict.passed for verdict in verdicts] == [passed, passed]
+
+
+NO_NUMBERS = {
+    "nothing": "{}",
+    "null": '{"psnr": null, "ssim": {"value": null, "reason": "x"}}',
+    "other names": '{"speed": 3}',
+    "no value": '{"psnr": {}}',
+}
+
+
+@pytest.mark.parametrize("aggregate", NO_NUMBERS.values(), ids=NO_NUMBERS)
+def test_a_baseline_with_which_nothing_can_be_compared_is_bad_data(
+    aggregate: str, tmp_path: Path
+) -> None:
+    path = written(tmp_path / "a.json", report() | {"aggregate": json.loads(aggregate)})
+    with pytest.raises(DataError, match=r"a\.json: has no number for any metric"):
+        read_gates(Demands(baseline=path))
+
+
+NOT_NUMBERS = "-Infinity", "NaN", "1e999", '"25"', "[25.0]", "true", '{"value": "x"}', "1" * 400
+
+
+@pytest.mark.parametrize("value", NOT_NUMBERS)
+@pytest.mark.parametrize("tolerance", [(), ("ssim=1",)])
+def test_a_baseline_with_a_metric_that_is_no_number_is_bad_data(
+    value: str, tolerance: tuple[str, ...], tmp_path: Path
+) -> None:
+    path = written(tmp_path / "a.json", report(psnr="?", ssim=0.5))
+    path.write_text(path.read_text().replace('"?"', value))
+    with pytest.raises(DataError, match=r"a\.json: damaged: ") as caught:
+        read_gates(Demands(baseline=path, tolerance=tolerance))
+    assert "\n" not in str(caught.value) and len(str(caught.value)) < 200 + len(str(path))
+
+
+def test_a_baseline_whose_conventions_are_none_is_bad_data(tmp_path: Path) -> None:
+    document = report(psnr=25.0)
+    document["protocol"] = PROTOCOL | {"conventions": ["psnr"]}
+    with pytest.raises(DataError, match="its conventions are no JSON object"):
+        read_gates(Demands(baseline=written(tmp_path / "a.json", document)))
 
 
 @pytest.mark.parametrize("key", SAME)

@@ -42,3 +42,18 @@ def test_what_is_no_json_object_is_damaged(tmp_path: Path, content: str) -> None
     (tmp_path / "a.json").write_text(content)
     with pytest.raises(DataError, match=r"a\.json: damaged"):
         read_json(tmp_path / "a.json")
+
+
+@pytest.mark.parametrize("text", ["NaN", "Infinity", "-Infinity", "[1, NaN]"])
+def test_numbers_that_json_has_not_are_refused(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "a.json"
+    path.write_text(f'{{"value": {text}}}')
+    with pytest.raises(DataError, match=r"a\.json: damaged: -?\w+ is not a number that JSON has"):
+        read_json(path)
+
+
+def test_json_that_is_nested_too_deeply_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "a.json"
+    path.write_text('{"a":' * 100_000)
+    with pytest.raises(DataError, match="nested too deeply"):
+        read_json(path)
