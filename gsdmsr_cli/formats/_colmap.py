@@ -225,10 +225,9 @@ def _images_text(path: Path) -> Iterator[Image]:
 
 
 def _points_text(path: Path) -> Iterator[Floats]:
-    """Yield a (1, 6) table per point."""
-    for line in _lines(path):
-        if words := line.split():
-            x, y, z, red, green, blue = map(float, words[1:7])
-            if not 0 <= min(red, green, blue) <= max(red, green, blue) <= 255:
-                raise ValueError(f"a point has the colour {red:g} {green:g} {blue:g}")
-            yield np.array([[x, y, z, red, green, blue]])
+    """Yield the (P, 6) table of points at once."""
+    rows = [words[1:7] for line in _lines(path) if (words := line.split())]
+    table = np.array(rows, dtype=np.float64).reshape(-1, 6)
+    if not ((table[:, 3:] >= 0) & (table[:, 3:] <= 255)).all():
+        raise ValueError("a point has a colour outside 0 to 255")
+    yield table
