@@ -125,6 +125,20 @@ def test_the_first_step_has_the_length_of_the_rate() -> None:
 
 
 @pytest.mark.parametrize("steps", [adam_steps, adam_steps_twin])
+@pytest.mark.parametrize("multipliers", [None, torch.ones(20)], ids=["flat", "rows"])
+@pytest.mark.parametrize("size", [1e-9, 1e-12, EPS])
+def test_tiny_gradients_make_steps_of_nearly_the_rate(
+    steps: Steps, multipliers: Tensor | None, size: float
+) -> None:
+    """The epsilon is added to the root: rate * g / (|g| + epsilon), half the rate where g is it."""
+    gradient = torch.full((20,), size)
+    gradient[::2] *= -1
+    values = moved(steps, torch.zeros(20), [gradient], multipliers, rate=0.03)[0]
+    expected = -0.03 * gradient.sign() * size / (size + EPS)
+    torch.testing.assert_close(values, expected, rtol=1e-4, atol=0)
+
+
+@pytest.mark.parametrize("steps", [adam_steps, adam_steps_twin])
 def test_the_trace_is_the_step_with_multiplier_1(steps: Steps) -> None:
     rng = generator(5)
     start, first, second = torch.randn(21, 3, generator=rng), *torch.rand(2, 21, 3, generator=rng)

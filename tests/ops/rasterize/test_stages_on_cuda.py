@@ -13,7 +13,7 @@ from torch import Tensor
 
 from gsdmsr_cli.gaussians.moment import Moment
 from gsdmsr_cli.gaussians.splats import Splats
-from gsdmsr_cli.ground.splatting_constants import tile_grid
+from gsdmsr_cli.ground.splatting_constants import DILATION, tile_grid
 from gsdmsr_cli.ops.photometric import photometric_loss_twin
 from gsdmsr_cli.ops.rasterize.cuda import room, stages
 from gsdmsr_cli.raster import cuda
@@ -153,8 +153,10 @@ def test_more_tiles_than_two_bytes_can_tell_apart() -> None:
     few = replace(few, means=means, log_scales=torch.full((6, 3), math.log(2.0)))
     with torch.no_grad():
         frame = cuda.rasterize(Moment(few), view, torch.zeros(3))
-    middles = frame.alpha[places.long(), 8]
-    assert torch.allclose(middles, few.logit_opacities.sigmoid(), rtol=0.15)
+    rows = places.long()
+    squares = (rows + 0.5 - places) ** 2 + 0.5**2  # columns: of the pixel 8.5, of the splats 8
+    expected = few.logit_opacities.sigmoid() * torch.exp(-0.5 * squares / (2.0**2 + DILATION))
+    torch.testing.assert_close(frame.alpha[rows, 8], expected.detach(), rtol=0.01, atol=0)
     assert not frame.alpha[10_000:90_000].any()
 
 

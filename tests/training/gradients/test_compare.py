@@ -10,8 +10,10 @@ from datasets import noise
 from torch import Tensor
 from training_checks import preset_of, trainer_of
 
+from gsdmsr_cli.gaussians.frame import Frame
 from gsdmsr_cli.gaussians.moment import Moment
 from gsdmsr_cli.model.model import Model
+from gsdmsr_cli.ops.photometric import photometric_loss_twin
 from gsdmsr_cli.raster import load_engine
 from gsdmsr_cli.scene.camera import Camera
 from gsdmsr_cli.training.gradients.compare import compare
@@ -32,11 +34,15 @@ def half(height: int, width: int) -> Tensor:
 
 
 def compared(
-    trainer: Trainer, target: Tensor, ssim: float, counted: Tensor | None, engine: str = "cpu"
+    trainer: Trainer,
+    target: Tensor,
+    ssim: float,
+    counted: Tensor | None,
+    engine: str = "cpu",
+    weights: Tensor | None = None,
 ) -> ViewGradients:
     model: Model = trainer.model
     camera: Camera = trainer.renderer.pictures.camera(trainer.views[0])
-    weights = None
     return compare(
         load_engine(engine), model, Moment(model.splats), camera, BACKGROUND, target, ssim, 1,
         weights, counted,
@@ -47,26 +53,63 @@ def gradients(found: ViewGradients) -> list[Tensor]:
     return [gradient for gradient in (*found.gradients, found.on_screen) if gradient is not None]
 
 
+def drawn(trainer: Trainer) -> Frame:
+    """What the engine without tiles draws of the first view."""
+    camera: Camera = trainer.renderer.pictures.camera(trainer.views[0])
+    moment = Moment(trainer.model.splats)
+    return load_engine("reference").rasterize(moment, camera, BACKGROUND, 1)
+
+
 @pytest.mark.parametrize("ssim", [0.0, 0.2])
-def test_what_does_not_count_may_be_anything(trainer: Trainer, ssim: float) -> None:
+@pytest.mark.parametrize("engine", ["cpu", "reference"])
+def test_pixels_that_do_not_count_are_taken_for_right(
+    trainer: Trainer, ssim: float, engine: str
+) -> None:
+    """Also by windows that reach there: the loss is that of a picture with the true ones there."""
+    target = trainer.renderer.pictures.load(trainer.views[0])
+    counted = half(*target.shape[1:])
+    true = target.permute(1, 2, 0).double() / 255
+    rgb = torch.where(counted[..., None], drawn(trainer).rgb.double(), true)
+    expected = photometric_loss_twin(rgb, target, ssim).item()
+    found = compared(trainer, target, ssim, counted, engine).loss.item()
+    assert found == pytest.approx(expected, rel=1e-4)
+
+
+@pytest.mark.parametrize("engine", ["cpu", "reference"])
+def test_the_statistic_under_tiles_is_of_those_drawn_whatever_their_weights(
+    trainer: Trainer, engine: str
+) -> None:
+    """Tiles of 16 px, three in a row; the loss has the weights, the gradient on the screen none."""
+    target = trainer.renderer.pictures.load(trainer.views[0])
+    weights = torch.tensor([0.0, 4.5, 0.5, 2.0, 0.0, 0.0, 0.0, 9.0, 1.0])
+    frame = drawn(trainer)
+    errors = (frame.rgb - target.permute(1, 2, 0) / 255).abs().sum(dim=2)
+    spread = weights.view(3, 3).repeat_interleave(16, 0).repeat_interleave(16, 1)
+    loss = (errors * spread).sum() / target.numel()
+    seen = (errors * (spread > 0)).sum() / target.numel()
+    (on_screen,) = torch.autograd.grad(seen, frame.means2d)
+    found = compared(trainer, target, 0.0, None, engine, weights)
+    assert found.loss.item() == pytest.approx(loss.item(), rel=1e-4)
+    largest = float(on_screen.abs().max())
+    torch.testing.assert_close(found.on_screen, on_screen, rtol=1e-3, atol=1e-4 * largest)
+    assert found.tile_errors is not None
+    per_tile = errors.detach().view(3, 16, 3, 16).sum(dim=(1, 3)).flatten() * (weights > 0)
+    torch.testing.assert_close(found.tile_errors.float(), per_tile, rtol=1e-4, atol=1e-4)
+
+
+def test_what_does_not_count_may_be_anything(trainer: Trainer) -> None:
+    """But for windows of SSIM, which see the true pixels there on both sides."""
+    ssim = 0.0
     target = trainer.renderer.pictures.load(trainer.views[0])
     counted = half(*target.shape[1:])
     other = torch.where(counted, target, torch.from_numpy(noise(48, 48, 3)).permute(2, 0, 1))
     one, same = (compared(trainer, picture, ssim, counted) for picture in (target, other))
     plain = compared(trainer, other, ssim, None)
-    # the windows of SSIM that reach beyond the middle see the true pixels there on both sides, and
-    # which those are changes what they say of the pixels that count
-    if ssim == 0:
-        assert one.loss == same.loss != plain.loss
-        for found, expected in zip(gradients(same), gradients(one), strict=True):
-            assert torch.equal(found, expected)
-        assert one.tile_errors is not None and same.tile_errors is not None
-        assert torch.equal(one.tile_errors, same.tile_errors)
-    else:
-        assert (
-            same.loss.item() == pytest.approx(one.loss.item(), rel=0.1)
-            and plain.loss > 1.5 * one.loss
-        )
+    assert one.loss == same.loss != plain.loss
+    for found, expected in zip(gradients(same), gradients(one), strict=True):
+        assert torch.equal(found, expected)
+    assert one.tile_errors is not None and same.tile_errors is not None
+    assert torch.equal(one.tile_errors, same.tile_errors)
 
 
 @pytest.mark.parametrize("ssim", [0.0, 0.2])
