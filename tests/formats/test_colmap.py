@@ -65,8 +65,8 @@ def write_binary(folder: Path, model: str = "OPENCV", tracks: int = 3) -> None:
     images = struct.pack("<Q", COUNT)
     for i in reversed(range(COUNT)):  # in an order of its own
         images += struct.pack("<i7di", i + 1, *quaternion(i), *translation(i), 7)
-        images += f"f{i:03d}.png".encode() + b"\0" + struct.pack("<Q", i)
-        images += b"".join(struct.pack("<ddq", 1.0, 2.0, -1) for _ in range(i))
+        images += f"f{i:03d}.png".encode() + b"\0" + struct.pack("<Q", COUNT - i)
+        images += b"".join(struct.pack("<ddq", 1.0, 2.0, -1) for _ in range(COUNT - i))
     (folder / "images.bin").write_bytes(images)
     points = struct.pack("<Q", len(POINTS))
     for i, (point, colour) in enumerate(zip(POINTS, COLOURS, strict=True)):
