@@ -16,8 +16,6 @@ from gsdmsr_cli.ground.progress import OnProgress
 from gsdmsr_cli.scene.imaging import read_image, write_png
 from gsdmsr_cli.scene.scene import MASK, MOVING, Scene, View
 
-POINTS = "points.ply"
-
 FOLDERS = {MASK: "counted", MOVING: "masks"}
 """Where the files of each signal are written."""
 
@@ -37,10 +35,10 @@ def write_converted(folder: Path, scene: Scene, on_progress: OnProgress) -> None
     for done, view in enumerate(scene.views, start=1):
         views.append(_placed(folder, view))
         on_progress(done, len(scene.views))
-    write.write_transforms(folder / "transforms.json", views, POINTS)
+    write.write_transforms(folder / "transforms.json", views, write.POINTS)
     colours = np.full(scene.points.shape, GREY) if scene.colours is None else scene.colours
     levels = np.rint(colours * 255).clip(0, 255).astype(np.uint8)
-    write.write_points(folder / POINTS, scene.points.astype(np.float64), levels)
+    write.write_points(folder / write.POINTS, scene.points.astype(np.float64), levels)
     provenance: dict[str, Any] = {
         "input": {"name": scene.root.name, "kind": scene.layout, "sha256": scene.fingerprint},
         "versions": versions(),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass
@@ -35,8 +34,6 @@ from gsdmsr_cli.ground.progress import OnProgress
 
 ShowProgress = Callable[[str], AbstractContextManager[OnProgress]]
 """Called with the name of a piece of work; yields the function that its progress is reported to."""
-
-POINTS, REPORT = "points.ply", "report.html"
 
 TRUSTED = 3
 """Points that fewer frames have found do not become points to start from."""
@@ -72,8 +69,9 @@ def prepare(
         moving, masked_by = pipeline.find_masks(frames, first), "found"
     matches, found = pipeline.find_cameras(frames, features, moving)
     require_registered(frames, found, options.min_registered)
-    shares = moving_share(matches, found), turning_share(matches, found.lens)
-    quality = assess(frames, found, *shares, masked_by, moving)
+    with show_progress("judging the cameras"):
+        shares = moving_share(matches, found), turning_share(matches, found.lens)
+        quality = assess(frames, found, *shares, masked_by, moving)
     provenance = {
         "input": {"name": source.root.name, "kind": source.kind, "sha256": pipeline.key["source"]},
         "masks": masked_by,
@@ -247,23 +245,10 @@ def _write_scene(
         views = write.write_masks(folder, masks, views, found.lens)
     pictures = frames.folder if rig is None else rig.folder
     write.write_pictures(folder, pictures, views, found.lens, on_progress)
-    write.write_transforms(folder / "transforms.json", views, POINTS)
+    write.write_transforms(folder / "transforms.json", views, write.POINTS)
     trusted = found.tracks >= (TRUSTED if rig is None else 2)
-    write.write_points(folder / POINTS, points[trusted], found.colours[trusted])
+    write.write_points(folder / write.POINTS, points[trusted], found.colours[trusted])
     title = f"Cameras of {provenance['input']['name']}"
-    write_page(folder / REPORT, title, quality, cameras, np.asarray(points[trusted]))
+    write_page(folder / write.REPORT, title, quality, cameras, np.asarray(points[trusted]))
     duration = frames.duration if rig is None else rig.times[-1]
     write.write_note(folder / write.NOTE, bound, duration, provenance, quality)
-
-
-def publish(scene: Path, out: Path) -> None:
-    """Move a finished scene to ``out``, in place of an earlier one."""
-    out.parent.mkdir(parents=True, exist_ok=True)
-    if out.exists():
-        earlier = out.with_name(f".{out.name}.earlier")
-        shutil.rmtree(earlier, ignore_errors=True)
-        out.rename(earlier)
-        scene.rename(out)
-        shutil.rmtree(earlier)
-    else:
-        scene.rename(out)

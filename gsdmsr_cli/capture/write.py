@@ -22,7 +22,10 @@ from gsdmsr_cli.scene.scene import MOVING, SPLITS, View
 SCHEMA = 1
 """Of scene.json; it grows when the meaning of a key changes."""
 
-NOTE = "scene.json"
+NOTE, POINTS, REPORT = "scene.json", "points.ply", "report.html"
+
+TIMINGS = "timings.json"
+"""The one file of a scene that differs between runs on the same input."""
 
 _TO_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 

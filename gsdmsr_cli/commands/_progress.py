@@ -6,16 +6,31 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from rich.console import Console
-from rich.progress import Progress
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
 
 from gsdmsr_cli.ground.progress import OnProgress
 
 
 @contextmanager
-def progress_bar(description: str) -> Iterator[OnProgress]:
-    """Show a bar that disappears at the end; yield the function that moves it."""
-    console = Console(stderr=True)
-    with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
+def progress_bar(description: str, console: Console | None = None) -> Iterator[OnProgress]:
+    """Show a bar that disappears at the end; yield the function that moves it.
+
+    Beside it stand what is done, the time that has gone and the time that is left.
+    """
+    console = console or Console(stderr=True)
+    columns = (
+        TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(),
+        TextColumn("left"), TimeRemainingColumn(),
+    )  # fmt: skip
+    hidden = not console.is_terminal
+    with Progress(*columns, console=console, transient=True, disable=hidden) as progress:
         task = progress.add_task(description, total=None)
         yield lambda done, total: progress.update(task, completed=done, total=total)
 

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import json
 import shlex
-import time
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Mapping
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -14,19 +13,27 @@ from rich.console import Console
 from rich.table import Table
 
 from gsdmsr_cli.capture.options import Options
-from gsdmsr_cli.capture.prepare import REPORT, Masks, convert, prepare, publish
+from gsdmsr_cli.capture.order import Order
+from gsdmsr_cli.capture.prepare import Masks, convert, prepare
+from gsdmsr_cli.capture.publish import (
+    finish,
+    is_free,
+    is_scene,
+    place_of,
+    publish,
+    require_own,
+    restore,
+    stages_of,
+)
 from gsdmsr_cli.capture.report import rows
 from gsdmsr_cli.capture.source import find_source
 from gsdmsr_cli.capture.stages import Stages
-from gsdmsr_cli.capture.write import NOTE
-from gsdmsr_cli.commands._progress import progress_bar
+from gsdmsr_cli.capture.write import NOTE, REPORT, TIMINGS
+from gsdmsr_cli.commands._stages_display import StagesDisplay
 from gsdmsr_cli.formats import recognised
-from gsdmsr_cli.ground.errors import UsageError
+from gsdmsr_cli.ground.errors import DataError, UsageError
 from gsdmsr_cli.ground.files import read_json, write_json
-from gsdmsr_cli.ground.progress import OnProgress
-
-TIMINGS = "timings.json"
-"""The one file of a scene that differs between runs on the same input."""
+from gsdmsr_cli.ground.locks import one_of_readers, sole_writer
 
 
 def run(
@@ -53,53 +60,71 @@ def run(
 
     Raises:
         UsageError: ``out`` is in use.
-        DataError: what was given cannot be used, or the scene not be written.
+        DataError: what was given cannot be used, or the scene not be written; or another process
+            writes or reads there.
         KeyboardInterrupt: Ctrl-C; what is finished is kept for the same command.
     """
-    _refuse_used(out, overwrite)
-    stages = Stages(out.with_name(f"{out.name}.stages"))
-    stopwatch = _Stopwatch()
+    display = StagesDisplay()
+    place = place_of(out)
+    if place == given.resolve():
+        raise UsageError(f"{out}: is INPUT; choose another --out")
+    source = None if kind is None and recognised(given) else find_source(given, kind)
+    if source is None:
+        _refuse_masks(given, masks, options)
+    order = Order(given, kind, masks, options)
+    stages = Stages(stages_of(place))
     try:
-        if kind is None and recognised(given):
-            _refuse_masks(given, masks, options)
-            scene = convert(given, stages, stopwatch.show_progress)
-        else:
-            scene = prepare(
-                find_source(given, kind), masks, options, stages, stopwatch.show_progress
-            )
+        with ExitStack() as locks:
+            _take_places(locks, out, place, stages)
+            if not order.is_published(place, stages):
+                _refuse_used(out, place, overwrite)
+                if given.is_dir():
+                    locks.enter_context(one_of_readers(given))
+                scene = (
+                    convert(given, stages, display.show)
+                    if source is None
+                    else prepare(source, masks, options, stages, display.show)
+                )
+                publication = order.announce(stages)
+                timings = {"seconds": display.seconds(), "given": str(given.resolve())}
+                write_json(scene / TIMINGS, timings | publication)
+                publish(scene, place)
+            if not keep:
+                stages.remove()
     except KeyboardInterrupt:
         if stages.root.is_dir():
             text = f"interrupted; finished stages are kept in {shlex.quote(str(stages.root))}"
             Console(stderr=True).out(f"{text} and the same command goes on", highlight=False)
         raise
-    write_json(scene / TIMINGS, {"seconds": stopwatch.seconds, "given": str(given.resolve())})
-    publish(scene, out)
-    if not keep:
-        stages.remove()
+    _tell(out, display.seconds(), as_json)
+
+
+def _take_places(locks: ExitStack, out: Path, place: Path, stages: Stages) -> None:
+    """Hold all folders that are written; finish what a killed process has begun there."""
+    if place.exists() and not place.is_dir():
+        raise UsageError(f"{out}: exists and is no scene of prepare's; choose another --out")
+    if place.is_dir():
+        locks.enter_context(sole_writer(place))
+    locks.enter_context(stages.held())
+    try:
+        restore(place)
+        finish(place)
+    except OSError as error:
+        where, reason = error.filename or place, error.strerror or error
+        raise DataError(f"{where}: cannot be written: {reason}; free space") from error
+
+
+def _tell(out: Path, seconds: Mapping[str, float], as_json: bool) -> None:
     note = read_json(out / NOTE)
+    console = Console()
     if as_json:
-        Console().out(json.dumps(note | {"seconds": stopwatch.seconds}, indent=2), highlight=False)
+        console.out(json.dumps(note | {"seconds": seconds}, indent=2), highlight=False)
         return
     if note["quality"] is not None:
         _show(note["quality"], out)
-    console = Console()
-    console.out(f"wrote {out} in {sum(stopwatch.seconds.values()):.0f} s", highlight=False)
+    console.out(f"wrote {out} in {sum(seconds.values()):.0f} s", highlight=False)
     command = shlex.join(["gsdmsr", "train", "--data", str(out), "--out", "runs/" + out.name])
     console.out(f"next: {command}", highlight=False)
-
-
-class _Stopwatch:
-    """Shows a bar for every stage and remembers how long each took."""
-
-    def __init__(self) -> None:
-        self.seconds: dict[str, float] = {}
-
-    @contextmanager
-    def show_progress(self, description: str) -> Iterator[OnProgress]:
-        started = time.perf_counter()
-        with progress_bar(description) as on_progress:
-            yield on_progress
-        self.seconds[description] = round(time.perf_counter() - started, 2)
 
 
 def _refuse_masks(given: Path, masks: Masks | None, options: Options) -> None:
@@ -111,15 +136,15 @@ def _refuse_masks(given: Path, masks: Masks | None, options: Options) -> None:
         )
 
 
-def _refuse_used(out: Path, overwrite: bool) -> None:
-    """Raise UsageError unless ``out`` is free or an earlier scene that may be replaced."""
-    if not out.exists() or (out.is_dir() and not any(out.iterdir())):
+def _refuse_used(out: Path, place: Path, overwrite: bool) -> None:
+    """Raise UsageError unless ``place`` is free or an earlier scene that may be replaced."""
+    if is_free(place):
         return
-    ours = out.is_dir() and (out / NOTE).is_file() and "gsdmsr" in read_json(out / NOTE)
-    if not ours:
+    if not is_scene(place):
         raise UsageError(f"{out}: exists and is no scene of prepare's; choose another --out")
     if not overwrite:
         raise UsageError(f"{out}: holds a scene already; give --overwrite or another --out")
+    require_own(place)
 
 
 def _show(quality: dict[str, Any], out: Path) -> None:

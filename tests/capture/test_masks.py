@@ -81,8 +81,11 @@ def test_masks_that_are_found_save_the_cameras_as_well(
     swaying: tuple[Path, room.Shots], tmp_path: Path
 ) -> None:
     pictures, shots = swaying
-    ended = prepare(pictures, "--out", tmp_path / "scene", "--auto-mask")
+    ended = prepare(pictures, "--out", tmp_path / "scene", "--auto-mask", "--json")
     assert ended.returncode == 0, ended.stderr
+    seconds = json.loads(ended.stdout)["seconds"]
+    assert {"finding cameras", "finding cameras again", "finding what moves"} <= seconds.keys()
+    assert seconds["finding cameras again"] > 0 and seconds["other"] < 0.2 * sum(seconds.values())
     assert error_of(tmp_path / "scene", shots) < 0.003
     shared = united = 0
     for view in read_scene(tmp_path / "scene").views:
