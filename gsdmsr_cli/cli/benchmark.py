@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from gsdmsr_cli.cli.options import Background, Json
+from gsdmsr_cli.cli.options import Background
 from gsdmsr_cli.ground.errors import UsageError
 
 
@@ -28,12 +28,11 @@ def kernels(
         Path | None, typer.Option(metavar="DIR", help="Folder of other kernels to compare with.")
     ] = None,
     device: Annotated[Literal["cpu", "cuda"], typer.Option(help="What to time.")] = "cpu",
-    as_json: Json = False,
 ) -> None:
     """Time drawing and a training step, forward and backward."""
     from gsdmsr_cli.commands import benchmark_kernels as command
 
-    command.run(yardstick, device, as_json)
+    command.run(yardstick, device)
 
 
 def scenes(
@@ -67,7 +66,6 @@ def scenes(
         int,
         typer.Option(min=1, metavar="N", help="Trials side by side, each on its share of cores."),
     ] = 1,
-    as_json: Json = False,
 ) -> None:
     """Train presets on scenes at equal lengths and print the table of their scores."""
     lengths: list[str | int] = [*(budget or []), *(steps or [])]
@@ -78,7 +76,7 @@ def scenes(
 
     terms = Terms(downscale, background, split, lpips_weights, jobs)
     presets: list[str | Path] = [*(preset or []), *(config or [])]
-    command.run(folders, out, presets or ["dnerf"], lengths, seed or [0], terms, as_json)
+    command.run(folders, out, presets or ["dnerf"], lengths, seed or [0], terms)
 
 
 def resume(
@@ -94,13 +92,12 @@ def resume(
     overrides: Annotated[
         list[str] | None, typer.Option("--set", metavar="a.b=v", help="One option; repeatable.")
     ] = None,
-    as_json: Json = False,
 ) -> None:
     """Kill trainings at random moments, resume them, and compare how they end."""
     from gsdmsr_cli.commands import benchmark_resume as command
 
     asked = [f"training.steps={steps}", f"data.downscale={downscale}", *(overrides or [])]
-    command.run(folder, out, preset, asked, kills, seed, as_json)
+    command.run(folder, out, preset, asked, kills, seed)
 
 
 def still(
@@ -113,12 +110,11 @@ def still(
     data: Annotated[
         Path | None, typer.Option(metavar="DIR", help="Where the data lies now, if elsewhere.")
     ] = None,
-    as_json: Json = False,
 ) -> None:
     """Let what hardly moves stand still, and measure PSNR and frames a second."""
     from gsdmsr_cli.commands import benchmark_still as command
 
-    command.run(run, below or [0.1, 0.3, 1.0, 3.0], split, data, as_json)
+    command.run(run, below or [0.1, 0.3, 1.0, 3.0], split, data)
 
 
 def soak(
@@ -128,21 +124,19 @@ def soak(
     every: Annotated[
         float, typer.Option(min=0.1, metavar="S", help="Seconds between two samples.")
     ] = 10.0,
-    as_json: Json = False,
 ) -> None:
     """Run a long command and tell whether its memory and open files grow."""
     from gsdmsr_cli.commands import benchmark_soak
 
-    benchmark_soak.run(command, every, as_json)
+    benchmark_soak.run(command, every)
 
 
 def reading(
     out: Annotated[Path, typer.Option(metavar="DIR", help="Folder to write the capture to.")],
     pictures: Annotated[int, typer.Option(min=2, metavar="N", help="Pictures.")] = 10_000,
     points: Annotated[int, typer.Option(min=1, metavar="N", help="Points.")] = 5_000_000,
-    as_json: Json = False,
 ) -> None:
     """Write a large COLMAP model and measure how it is read: time and memory."""
     from gsdmsr_cli.commands import benchmark_reading as command
 
-    command.run(out, pictures, points, as_json)
+    command.run(out, pictures, points)

@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import typer
 
-from gsdmsr_cli.cli.options import Json
-
 
 def register(app: typer.Typer) -> None:
     """Add the command."""
     app.command()(doctor)
 
 
-def doctor(as_json: Json = False) -> None:
+def doctor() -> None:
     """Report what this machine offers and what is missing."""
     from gsdmsr_cli.commands import doctor as command
 
-    command.run(as_json)
+    command.run()

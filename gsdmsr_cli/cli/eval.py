@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from gsdmsr_cli.cli.options import Json, MovedData, RunFolder
+from gsdmsr_cli.cli.options import MovedData, RunFolder
 
 
 def register(app: typer.Typer) -> None:
@@ -31,7 +31,6 @@ def evaluate(
     lpips_inria: Annotated[
         bool, typer.Option("--lpips-inria", help="LPIPS on [0, 1] too, as in tables after 3DGS.")
     ] = False,
-    as_json: Json = False,
     out: Annotated[
         Path | None, typer.Option(metavar="DIR", help="Folder to write, if not RUN/eval.")
     ] = None,
@@ -69,7 +68,7 @@ def evaluate(
     demands = Demands(
         tuple(fail_under or ()), tuple(fail_over or ()), baseline, tuple(tolerance or ())
     )
-    output = Output(out, as_json, junit, github_summary, report)
+    output = Output(out, junit, github_summary, report)
     from gsdmsr_cli.commands import eval as command
 
     command.run(run_folder, request, demands, output, data)

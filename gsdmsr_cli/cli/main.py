@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import itertools
 import os
 import signal
 import sys
@@ -26,7 +27,8 @@ from gsdmsr_cli.cli import (
     weights,
 )
 from gsdmsr_cli.cli import eval as evaluate
-from gsdmsr_cli.ground import origin
+from gsdmsr_cli.cli._common import JSON, give_common_options
+from gsdmsr_cli.ground import origin, say
 from gsdmsr_cli.ground.errors import DataError, GsdmsrError, UsageError
 from gsdmsr_cli.ground.printing import is_printable, one_line
 from gsdmsr_cli.ground.streams import unfailing
@@ -44,6 +46,7 @@ app = typer.Typer(
 )
 for _command in _COMMANDS:
     _command.register(app)
+give_common_options(app)
 
 # What the machine, not the program, is to blame for when a file cannot be read or written.
 _MACHINE_ERRNOS = frozenset(
@@ -78,6 +81,11 @@ def _common(
     pass
 
 
+_INTERRUPTED = 130
+
+_KINDS = {1: "internal", 2: "usage", 3: "data", 4: "threshold", _INTERRUPTED: "interrupted"}
+"""What the errors of each exit code are called in JSON."""
+
 # The command-line errors of typer share this base, which typer does not export by name.
 _CommandLineError = cast(type[typer.BadParameter], typer.BadParameter.__base__)
 
@@ -88,11 +96,15 @@ def main() -> None:
 
 
 def _run() -> int:
-    with unfailing() as lost:
+    own = itertools.takewhile(lambda word: word != "--", sys.argv[1:])
+    with unfailing() as lost, say.on_its_own(as_json=JSON in own):
         code, reason = _call(), lost()
         if reason is not None and code == 0:
-            _tell(f"standard output cannot be written: {reason}; what was asked for is not whole")
             code = DataError.exit_code
+            message = (
+                f"standard output cannot be written: {reason}; what was asked for is not whole"
+            )
+            _tell(message, code)
     return code
 
 
@@ -102,18 +114,22 @@ def _call() -> int:
         with ctrl_c_that_spares_imports():
             result = typer.main.get_command(app).main(prog_name="gsdmsr", standalone_mode=False)
     except (KeyboardInterrupt, typer.Abort):
-        return 130
+        result = _INTERRUPTED
     except Exception as error:
         if os.environ.get("GSDMSR_DEBUG"):
             traceback.print_exc()
         message, code = _explain(error)
-        _tell(message)
+        _tell(message, code)
         return code
+    if result == _INTERRUPTED:  # typer makes an exit of Ctrl-C, or an Abort
+        say.answer_with_error(_KINDS[result], "interrupted", result)
     return result if isinstance(result, int) else 0
 
 
-def _tell(message: str) -> None:
-    typer.echo(f"error: {one_line(message)}", err=True)
+def _tell(message: str, code: int) -> None:
+    line = one_line(message)
+    say.warn(f"error: {line}")
+    say.answer_with_error(_KINDS.get(code, _KINDS[1]), line, code)
 
 
 def _require_printable(arguments: list[str]) -> None:

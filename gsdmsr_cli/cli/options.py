@@ -11,5 +11,4 @@ RunFolder = Annotated[Path, typer.Argument(metavar="RUN", help="Folder that trai
 MovedData = Annotated[
     Path | None, typer.Option("--data", metavar="DIR", help="Where the data lies now, if moved.")
 ]
-Json = Annotated[bool, typer.Option("--json", help="Print one JSON object and nothing else.")]
 Background = Literal["white", "black"]

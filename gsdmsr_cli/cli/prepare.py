@@ -7,7 +7,6 @@ from typing import Annotated, Literal
 
 import typer
 
-from gsdmsr_cli.cli.options import Json
 from gsdmsr_cli.ground.errors import UsageError, nearest
 
 
@@ -72,7 +71,6 @@ def prepare(
     keep_stages: Annotated[
         bool, typer.Option("--keep-stages", help="Keep them for a run with other options.")
     ] = False,
-    as_json: Json = False,
 ) -> None:
     """Turn a video or pictures into a scene with cameras."""
     from gsdmsr_cli.capture.options import CAMERA_MODELS, Options
@@ -107,4 +105,4 @@ def prepare(
 
     given_masks = None if masks is None else Masks(masks, invert_masks)
     kind = "rig" if rig else format_
-    command.run(given, out, kind, given_masks, options, overwrite, keep_stages, as_json)
+    command.run(given, out, kind, given_masks, options, overwrite, keep_stages)

@@ -7,7 +7,6 @@ from typing import Annotated
 
 import typer
 
-from gsdmsr_cli.cli.options import Json
 from gsdmsr_cli.ground.errors import UsageError
 
 
@@ -27,11 +26,10 @@ def weights(
     lpips_weights: Annotated[
         Path | None, typer.Option(metavar="DIR", help="Folder to look in first.")
     ] = None,
-    as_json: Json = False,
 ) -> None:
     """Say which weights of LPIPS are here; download them if told to."""
     if to is not None and not fetch:
         raise UsageError("--to is where --fetch downloads to; give both or neither")
     from gsdmsr_cli.commands import weights as command
 
-    command.run(fetch or [], to, lpips_weights, as_json)
+    command.run(fetch or [], to, lpips_weights)

@@ -15,6 +15,7 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
+from gsdmsr_cli.ground import say
 from gsdmsr_cli.ground.progress import OnProgress
 
 
@@ -29,7 +30,7 @@ def progress_bar(description: str, console: Console | None = None) -> Iterator[O
         TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(),
         TextColumn("left"), TimeRemainingColumn(),
     )  # fmt: skip
-    hidden = not console.is_terminal
+    hidden = not (console.is_terminal and say.shows_progress())
     with Progress(*columns, console=console, transient=True, disable=hidden) as progress:
         task = progress.add_task(description, total=None)
         yield lambda done, total: progress.update(task, completed=done, total=total)

@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from rich.console import Console
 
 from gsdmsr_cli.commands._progress import progress_bar
+from gsdmsr_cli.ground import say
 from gsdmsr_cli.ground.progress import OnProgress
 
 LINE_EVERY = 15.0
@@ -57,14 +58,14 @@ def _lines(name: str, console: Console) -> Iterator[OnProgress]:
     latest, ended, started = _Latest(), threading.Event(), time.perf_counter()
 
     def tell(text: str) -> None:
-        console.print(f"{name}: {text}", soft_wrap=True, highlight=False, markup=False)
+        _print(console, f"{name}: {text}")
 
     def keep_telling() -> None:
         while not ended.wait(LINE_EVERY):
             tell(latest.describe(time.perf_counter() - started))
 
     teller = threading.Thread(target=keep_telling, name="stage", daemon=True)
-    console.print(f"{name} ...", soft_wrap=True, highlight=False, markup=False)
+    _print(console, f"{name} ...")
     teller.start()
     try:
         yield latest.take
@@ -75,6 +76,12 @@ def _lines(name: str, console: Console) -> Iterator[OnProgress]:
     finally:
         ended.set()
         teller.join()
+
+
+def _print(console: Console, line: str) -> None:
+    if say.shows_progress():
+        console.print(line, soft_wrap=True, highlight=False, markup=False)
+    say.write_log(line)
 
 
 class _Latest:

@@ -7,6 +7,7 @@ from types import TracebackType
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn
 
+from gsdmsr_cli.ground import say
 from gsdmsr_cli.training.loop import Report
 
 LINE_EVERY = 0.05
@@ -21,7 +22,7 @@ class TrainingDisplay:
         self._live: Progress | None = None
         self._task = TaskID(0)
         self._next_line = 0.0
-        if self._console.is_terminal:
+        if self._console.is_terminal and say.shows_progress():
             columns = TextColumn("training"), BarColumn(), TextColumn("{task.description}")
             # few refreshes: the cores are training
             self._live = Progress(*columns, console=self._console, refresh_per_second=2)
@@ -42,12 +43,13 @@ class TrainingDisplay:
             self._live.stop()
 
     def show(self, report: Report) -> None:
-        """Show a report; without a terminal one in twenty or so."""
+        """Show a report; one in twenty or so becomes a line, of the log if there is a terminal."""
         if self._live is not None:
             self._live.update(self._task, completed=report.progress, description=describe(report))
-        elif report.progress >= min(self._next_line, 1.0):
+        if report.progress >= min(self._next_line, 1.0):
             self._next_line = report.progress + LINE_EVERY
-            self._console.print(describe(report), soft_wrap=True, highlight=False)
+            tell = say.note if self._live is None else say.write_log
+            tell(describe(report))
 
 
 def describe(report: Report) -> str:

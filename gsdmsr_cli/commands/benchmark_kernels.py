@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import json
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
 from rich.table import Table
 
 from gsdmsr_cli import raster
@@ -16,6 +13,8 @@ from gsdmsr_cli.backends.cpu.jit import threads
 from gsdmsr_cli.backends.cuda import availability
 from gsdmsr_cli.benchmark import gsplat, workloads, yardstick
 from gsdmsr_cli.benchmark.timing import in_turns
+from gsdmsr_cli.commands._progress import progress_bar
+from gsdmsr_cli.ground import say
 from gsdmsr_cli.ground.errors import UsageError
 
 CASES = {
@@ -27,7 +26,7 @@ CASES = {
 MOTIONS = ("hexplane", "multiscale", "control_points")
 
 
-def run(yardstick_folder: Path | None, device: str, as_json: bool) -> None:
+def run(yardstick_folder: Path | None, device: str) -> None:
     """Time every case, in turns with a yardstick if there is one, and print a table.
 
     On the CPU that is a folder of other kernels, on a GPU gsplat where it is installed.
@@ -36,21 +35,18 @@ def run(yardstick_folder: Path | None, device: str, as_json: bool) -> None:
         UsageError: a folder is given for a GPU.
         DataError: the device is not there, or the folder holds no yardstick.
     """
-    where, console = raster.pick_device(device), Console(stderr=True)
-    other = _yardstick(yardstick_folder, where, console)
+    where = raster.pick_device(device)
+    other = _yardstick(yardstick_folder, where)
     rows = []
     for size, count in CASES[where]:
-        with console.status(f"{size} x {size}, {count} splats"):
+        with progress_bar(f"{size} x {size}, {count} splats"):
             rows += _measure(size, count, where, other)
     usage = availability.usage(where)
-    if as_json:
-        document = {"schema": 1, "threads": threads(), "device": where, **usage, "rows": rows}
-        sys.stdout.write(json.dumps(document) + "\n")
-    else:
-        Console().print(_table(rows, usage["gpu"] or f"{threads()} threads"))
+    document = {"schema": 1, "threads": threads(), "device": where, **usage, "rows": rows}
+    say.result(document, _table(rows, usage["gpu"] or f"{threads()} threads"))
 
 
-def _yardstick(folder: Path | None, device: str, console: Console) -> Any:
+def _yardstick(folder: Path | None, device: str) -> Any:
     """Return what is timed beside us, or None."""
     if device == "cpu":
         return None if folder is None else yardstick.load_yardstick(folder)
@@ -58,7 +54,7 @@ def _yardstick(folder: Path | None, device: str, console: Console) -> Any:
         raise UsageError("--yardstick is for the CPU; on a GPU the yardstick is gsplat")
     found = gsplat.load_gsplat()
     if isinstance(found, str):
-        console.print(f"without a yardstick: {found}", markup=False, highlight=False)
+        say.note(f"without a yardstick: {found}")
         return None
     return found
 

@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
-import json
-import sys
 from dataclasses import asdict
 from pathlib import Path
 
-from rich.console import Console
 from rich.table import Table
 
 from gsdmsr_cli.benchmark.reading import Phase, measure, write_capture
 from gsdmsr_cli.commands._progress import progress_bar
+from gsdmsr_cli.ground import say
 from gsdmsr_cli.ground.errors import DataError
 
 SCHEMA = 1
 
 
-def run(out: Path, pictures: int, points: int, as_json: bool) -> None:
+def run(out: Path, pictures: int, points: int) -> None:
     """Write a capture to the folder ``out``, read it, and print what each phase took.
 
     Raises:
@@ -28,12 +26,9 @@ def run(out: Path, pictures: int, points: int, as_json: bool) -> None:
     with progress_bar("writing pictures") as on_progress:
         write_capture(out, pictures, points, on_progress)
     phases = list(measure(out))
-    if as_json:
-        rows = [asdict(phase) for phase in phases]
-        document = {"schema": SCHEMA, "pictures": pictures, "points": points, "phases": rows}
-        sys.stdout.write(json.dumps(document) + "\n")
-    else:
-        Console().print(_table(phases, f"{pictures} pictures, {points} points"))
+    rows = [asdict(phase) for phase in phases]
+    document = {"schema": SCHEMA, "pictures": pictures, "points": points, "phases": rows}
+    say.result(document, _table(phases, f"{pictures} pictures, {points} points"))
 
 
 def _table(phases: list[Phase], title: str) -> Table:

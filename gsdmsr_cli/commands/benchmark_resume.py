@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import json
-import sys
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 
-from rich.console import Console
 from rich.table import Table
 
 from gsdmsr_cli.benchmark.kills import Kill, survive
 from gsdmsr_cli.formats import read_scene
+from gsdmsr_cli.ground import say
 from gsdmsr_cli.ground.errors import GsdmsrError
 from gsdmsr_cli.options.preset import load_preset
 
@@ -26,7 +24,6 @@ def run(
     overrides: Sequence[str],
     kills: int,
     seed: int,
-    as_json: bool,
 ) -> None:
     """Train once undisturbed and ``kills`` times with a SIGKILL, and print what came of it.
 
@@ -39,20 +36,14 @@ def run(
     load_preset(preset, None, overrides)
     options = ["--data", str(scene), "--preset", preset]
     options += [part for override in overrides for part in ("--set", override)]
-    console = Console(stderr=True)
 
     def on_progress(kill: Kill) -> None:
         result = "identical" if kill.identical else "DIFFERENT"
-        console.out(
-            f"killed after {kill.after_s:.1f} s, {_source(kill)}: {result}", highlight=False
-        )
+        say.note(f"killed after {kill.after_s:.1f} s, {_source(kill)}: {result}")
 
     found = survive(options, out, kills, seed, on_progress)
-    if as_json:
-        document = {"schema": SCHEMA, "kills": [asdict(kill) for kill in found]}
-        sys.stdout.write(json.dumps(document) + "\n")
-    else:
-        Console().print(_table(found))
+    document = {"schema": SCHEMA, "kills": [asdict(kill) for kill in found]}
+    say.result(document, _table(found))
     different = sum(not kill.identical for kill in found)
     if different:
         raise GsdmsrError(

@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import json
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
 from rich.table import Table
 
 from gsdmsr_cli.benchmark.curves import charts_of
 from gsdmsr_cli.benchmark.scoreboard import HEADS, TEXTS, cells, markdown, rows_of
 from gsdmsr_cli.benchmark.trials import Terms, Trial, all_trials, run_side_by_side, run_trial
 from gsdmsr_cli.formats import read_scene
+from gsdmsr_cli.ground import say
 from gsdmsr_cli.ground.errors import UsageError
 from gsdmsr_cli.ground.files import write_json, write_text
 from gsdmsr_cli.ground.machine import cores
@@ -32,7 +30,6 @@ def run(
     lengths: Sequence[str | int],
     seeds: Sequence[int],
     terms: Terms,
-    as_json: bool,
 ) -> None:
     """Run every trial that is still to do, and write ``table.json``, ``table.md`` and charts.
 
@@ -52,13 +49,12 @@ def run(
         trial.options(terms)
     for scene in scenes:
         read_scene(scene)
-    console = Console(stderr=True)
     scored: list[tuple[Trial, dict[str, Any]]] = []
     for first in range(0, len(trials), terms.jobs):
         batch = trials[first : first + terms.jobs]
         for number, trial in enumerate(batch, start=first + 1):
             place = trial.folder(out) if terms.jobs == 1 else trial.log(out)
-            console.out(f"trial {number} of {len(trials)}: {place}", highlight=False)
+            say.note(f"trial {number} of {len(trials)}: {place}")
         if terms.jobs == 1:
             documents = [run_trial(trial, out, terms) for trial in batch]
         else:
@@ -68,11 +64,8 @@ def run(
         _write(out, rows, terms)
         for name, chart in charts_of([trial for trial, _ in scored], out).items():
             write_text(out / f"psnr-{name}.svg", chart)
-    if as_json:
-        sys.stdout.write(json.dumps(_document(rows, terms)) + "\n")
-    else:
-        Console(width=WIDTH).print(_table(rows, terms))
-        Console().out(f"written to {out / 'table.md'}", highlight=False)
+    written = f"written to {out / 'table.md'}"
+    say.result(_document(rows, terms), _table(rows, terms), written, width=WIDTH)
 
 
 def _document(rows: Sequence[dict[str, Any]], terms: Terms) -> dict[str, Any]:

@@ -2,42 +2,36 @@
 
 from __future__ import annotations
 
-import json
-import sys
 from collections.abc import Sequence
 from dataclasses import asdict
 
-from rich.console import Console
 from rich.table import Table
 
 from gsdmsr_cli.benchmark.soak import Sample, growth, tenths, watch
+from gsdmsr_cli.ground import say
 
 SCHEMA = 1
 
 
-def run(command: Sequence[str], every_s: float, as_json: bool) -> None:
+def run(command: Sequence[str], every_s: float) -> None:
     """Run a command and print what it held, a row for each tenth of its time.
 
     Args:
         command: the arguments of ``gsdmsr``.
         every_s: time between two samples [s].
-        as_json: print one JSON object, with every sample.
 
     Raises:
         GsdmsrError: the command has failed or was too short, or the system is not Linux.
     """
     samples = watch(command, every_s)
     slopes = growth(samples)
-    if as_json:
-        document = {
-            "schema": SCHEMA,
-            "command": list(command),
-            "samples": [asdict(sample) for sample in samples],
-            "growth_per_hour": asdict(slopes),
-        }
-        sys.stdout.write(json.dumps(document) + "\n")
-    else:
-        Console().print(_table(samples, slopes))
+    document = {
+        "schema": SCHEMA,
+        "command": list(command),
+        "samples": [asdict(sample) for sample in samples],
+        "growth_per_hour": asdict(slopes),
+    }
+    say.result(document, _table(samples, slopes))
 
 
 def _table(samples: Sequence[Sample], slopes: Sample) -> Table:

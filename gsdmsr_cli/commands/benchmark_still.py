@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-import json
-import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from statistics import median
 from typing import Any
 
-from rich.console import Console
 from rich.table import Table
 
 from gsdmsr_cli.commands._progress import part_of, progress_bar
 from gsdmsr_cli.commands._trained import Trained, open_trained
 from gsdmsr_cli.evaluation import protocol
 from gsdmsr_cli.evaluation.speed import measure_speed
+from gsdmsr_cli.ground import say
 from gsdmsr_cli.ground.errors import UsageError
 from gsdmsr_cli.model.model import Model
 from gsdmsr_cli.scene.scene import View
@@ -29,9 +27,7 @@ ROUNDS = 3
 """How often each model's speed is measured, in turns, so that a busy machine disturbs all alike."""
 
 
-def run(
-    run_folder: Path, below: Sequence[float], split: str, data: Path | None, as_json: bool
-) -> None:
+def run(run_folder: Path, below: Sequence[float], split: str, data: Path | None) -> None:
     """Print share of still splats, PSNR and frames a second for each threshold, and without.
 
     Raises:
@@ -65,11 +61,7 @@ def run(
                     "ratio": speeds[threshold] / speeds[0.0],
                 }
             )
-    if as_json:
-        document = {"schema": SCHEMA, "split": split, "rows": rows}
-        sys.stdout.write(json.dumps(document) + "\n")
-    else:
-        Console().print(_table(rows, split))
+    say.result({"schema": SCHEMA, "split": split, "rows": rows}, _table(rows, split))
 
 
 def _speeds(

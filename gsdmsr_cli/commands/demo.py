@@ -5,14 +5,13 @@ from __future__ import annotations
 import shlex
 from pathlib import Path
 
-from rich.console import Console
-
 from gsdmsr_cli.commands import eval as evaluate
 from gsdmsr_cli.commands import render, train
 from gsdmsr_cli.commands._progress import progress_bar
 from gsdmsr_cli.demo.synthetic import write_scene
 from gsdmsr_cli.evaluation.request import Output
 from gsdmsr_cli.filming.request import Request
+from gsdmsr_cli.ground import say
 from gsdmsr_cli.ground.errors import DataError, UsageError
 
 BUDGET = "60s"
@@ -33,10 +32,13 @@ def run(out: Path) -> None:
     scene, run_folder = out / "scene", out / "run"
     _write_scene(scene)
     overrides = [f"training.budget={BUDGET}"]
-    train.run(scene, run_folder, "dnerf", None, overrides, "auto", False, run_folder.exists())
-    evaluate.run(run_folder, None, None, Output(report=True))
-    render.run(run_folder, Request(), None)
-    Console().out(_where_to_look(scene, run_folder), highlight=False)
+    with say.parts() as answers:
+        train.run(scene, run_folder, "dnerf", None, overrides, "auto", False, run_folder.exists())
+        evaluate.run(run_folder, None, None, Output(report=True))
+        render.run(run_folder, Request(), None)
+    parts = dict(zip(("train", "eval", "render"), answers, strict=False))
+    places = _places(scene, run_folder)
+    say.result({"places": places, **parts}, _where_to_look(places, run_folder))
 
 
 def _claim(out: Path) -> None:
@@ -58,11 +60,16 @@ def _write_scene(folder: Path) -> None:
         write_scene(folder, progress=on_progress)
 
 
-def _where_to_look(scene: Path, run_folder: Path) -> str:
+def _places(scene: Path, run_folder: Path) -> list[tuple[str, str]]:
+    """Return what there is to look at, and where."""
     places = [("the pictures it was trained on", scene / "train")]
     places += [("video", path) for path in sorted(run_folder.rglob("*.webm"))]
     places += [("scores", run_folder / "eval" / "metrics.json")]
     places += [("report, for a browser", run_folder / "eval" / "report.html")]
+    return [(what, str(path)) for what, path in places]
+
+
+def _where_to_look(places: list[tuple[str, str]], run_folder: Path) -> str:
     lines = [f"  {what}: {path}" for what, path in places]
     folder = shlex.quote(str(run_folder))
     export = f"gsdmsr export {folder} --format ply --time 0.5 --out half.ply"

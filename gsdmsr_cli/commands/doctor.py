@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import json
 import platform
 from importlib import metadata
 from typing import Any
 
 import llvmlite.binding as llvm
-from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
@@ -18,7 +16,7 @@ from gsdmsr_cli.evaluation.lpips import NETS, load_lpips
 from gsdmsr_cli.evaluation.metrics import Missing
 from gsdmsr_cli.filming.encode import require_encoder
 from gsdmsr_cli.filming.request import VIDEOS
-from gsdmsr_cli.ground import origin, plugins
+from gsdmsr_cli.ground import origin, plugins, say
 from gsdmsr_cli.ground.errors import GsdmsrError
 from gsdmsr_cli.ground.machine import cores
 from gsdmsr_cli.options import preset_files
@@ -42,13 +40,10 @@ _DEVICES = ("cpu", "cuda")
 _PLUGINS = ("gsdmsr_cli.model.motion", "gsdmsr_cli.formats", "gsdmsr_cli.exports")
 
 
-def run(as_json: bool) -> None:
-    """Print the report as a table, or as one JSON object."""
+def run() -> None:
+    """Print the report."""
     report = examine()
-    if as_json:
-        Console().out(json.dumps(report, indent=2), highlight=False)
-    else:
-        Console().print(_table(report))
+    say.result(report, _table(report))
 
 
 def examine() -> dict[str, Any]:

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Sequence
 from pathlib import Path
 
-from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
@@ -19,6 +17,7 @@ from gsdmsr_cli.evaluation.junit import junit
 from gsdmsr_cli.evaluation.markdown import markdown
 from gsdmsr_cli.evaluation.request import BOTH, Demands, Output, Request
 from gsdmsr_cli.evaluation.summary import Document
+from gsdmsr_cli.ground import say
 from gsdmsr_cli.ground.errors import DataError, ThresholdError, UsageError
 from gsdmsr_cli.ground.files import require_folder, write_json, write_text
 from gsdmsr_cli.reporting.frames import make_report_frames
@@ -65,7 +64,9 @@ def run(
         _append(summary_path, markdown(_heading(run_folder), document, verdicts))
     if output.report:
         _report(folder, trained, document, verdicts)
-    _print(document, verdicts, folder, output)  # last: whoever reads it may have left
+    say.result(
+        document, *_shown(document, verdicts, folder, output)
+    )  # last: its reader may be gone
     missed = [verdict.found for verdict in verdicts if not verdict.passed]
     if missed:
         raise ThresholdError("; ".join(missed))
@@ -102,17 +103,14 @@ def _append(path: Path, text: str) -> None:
         raise DataError(f"{path}: cannot be written: {error.strerror or error}") from error
 
 
-def _print(document: Document, verdicts: Sequence[Verdict], folder: Path, output: Output) -> None:
-    console = Console()
-    if output.as_json:
-        console.out(json.dumps(document), highlight=False)
-        return
-    console.print(_table(document))
-    for verdict in verdicts:
-        console.out(f"{'passed' if verdict.passed else 'FAILED'}: {verdict.found}", highlight=False)
-    console.out(f"written to {folder / 'metrics.json'}", highlight=False)
-    if output.report:
-        console.out(f"report: {folder / 'report.html'}", highlight=False)
+def _shown(
+    document: Document, verdicts: Sequence[Verdict], folder: Path, output: Output
+) -> list[Table | str]:
+    """Return the document for people."""
+    lines = [f"{'passed' if v.passed else 'FAILED'}: {v.found}" for v in verdicts]
+    lines += [f"written to {folder / 'metrics.json'}"]
+    lines += [f"report: {folder / 'report.html'}"] if output.report else []
+    return [_table(document), *lines]
 
 
 def _table(document: Document) -> Table:

@@ -6,10 +6,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import torch
-from rich.console import Console
 
 from gsdmsr_cli import exports
 from gsdmsr_cli.commands._progress import progress_bar
+from gsdmsr_cli.ground import say
 from gsdmsr_cli.options.preset_files import read_overrides
 from gsdmsr_cli.options.strict import Located
 from gsdmsr_cli.runs.run import open_run
@@ -45,7 +45,8 @@ def run(
         written = exports.export(format_, model, folder.facts, settings, out, on_progress)
     count, splats = len(written), len(model.splats)
     what = f"{out}" if count == 1 else f"{out}, {count} files"
-    Console().out(f"wrote {what}: {splats} splats", highlight=False)
+    document = {"format": format_, "files": [str(path) for path in written], "splats": splats}
+    say.result(document, f"wrote {what}: {splats} splats")
 
 
 def _settings(time: float | None, frames: int | None, overrides: Sequence[str]) -> Located:

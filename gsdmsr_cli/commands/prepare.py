@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import json
 import shlex
 from collections.abc import Mapping
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
 from rich.table import Table
 
 from gsdmsr_cli.capture.options import Options
@@ -31,6 +29,7 @@ from gsdmsr_cli.capture.stages import Stages
 from gsdmsr_cli.capture.write import NOTE, REPORT, TIMINGS
 from gsdmsr_cli.commands._stages_display import StagesDisplay
 from gsdmsr_cli.formats import recognised
+from gsdmsr_cli.ground import say
 from gsdmsr_cli.ground.errors import DataError, UsageError
 from gsdmsr_cli.ground.files import read_json, write_json
 from gsdmsr_cli.ground.locks import one_of_readers, sole_writer
@@ -44,7 +43,6 @@ def run(
     options: Options,
     overwrite: bool,
     keep: bool,
-    as_json: bool,
 ) -> None:
     """Write the scene folder ``out`` and print the report on its cameras.
 
@@ -56,7 +54,6 @@ def run(
         options: how the scene is made.
         overwrite: whether ``out`` may hold an earlier scene, which is replaced.
         keep: whether stages are kept for a run with other options.
-        as_json: whether one JSON object is printed instead of a table.
 
     Raises:
         UsageError: ``out`` is in use.
@@ -94,9 +91,9 @@ def run(
     except KeyboardInterrupt:
         if stages.root.is_dir():
             text = f"interrupted; finished stages are kept in {shlex.quote(str(stages.root))}"
-            Console(stderr=True).out(f"{text} and the same command goes on", highlight=False)
+            say.note(f"{text} and the same command goes on")
         raise
-    _tell(out, display.seconds(), as_json)
+    _tell(out, display.seconds())
 
 
 def _take_places(locks: ExitStack, out: Path, place: Path, stages: Stages) -> None:
@@ -114,17 +111,15 @@ def _take_places(locks: ExitStack, out: Path, place: Path, stages: Stages) -> No
         raise DataError(f"{where}: cannot be written: {reason}; free space") from error
 
 
-def _tell(out: Path, seconds: Mapping[str, float], as_json: bool) -> None:
+def _tell(out: Path, seconds: Mapping[str, float]) -> None:
     note = read_json(out / NOTE)
-    console = Console()
-    if as_json:
-        console.out(json.dumps(note | {"seconds": seconds}, indent=2), highlight=False)
-        return
-    if note["quality"] is not None:
-        _show(note["quality"], out)
-    console.out(f"wrote {out} in {sum(seconds.values()):.0f} s", highlight=False)
     command = shlex.join(["gsdmsr", "train", "--data", str(out), "--out", "runs/" + out.name])
-    console.out(f"next: {command}", highlight=False)
+    say.result(
+        note | {"seconds": seconds, "next": command},
+        *([] if note["quality"] is None else _shown(note["quality"], out)),
+        f"wrote {out} in {sum(seconds.values()):.0f} s",
+        f"next: {command}",
+    )
 
 
 def _refuse_masks(given: Path, masks: Masks | None, options: Options) -> None:
@@ -147,12 +142,10 @@ def _refuse_used(out: Path, place: Path, overwrite: bool) -> None:
     require_own(place)
 
 
-def _show(quality: dict[str, Any], out: Path) -> None:
-    console = Console()
+def _shown(quality: dict[str, Any], out: Path) -> list[Table | str]:
+    """Return the report on the cameras for people."""
     table = Table(show_header=False)
     for what, value in rows(quality):
         table.add_row(what, value)
-    console.print(table)
-    for warning in quality["warnings"]:
-        console.out(f"warning: {warning}", highlight=False)
-    console.out(f"the camera's path: {out / REPORT}", highlight=False)
+    warnings = [f"warning: {warning}" for warning in quality["warnings"]]
+    return [table, *warnings, f"the camera's path: {out / REPORT}"]

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
-
-from rich.console import Console
+from typing import Any
 
 from gsdmsr_cli.commands._progress import progress_bar
 from gsdmsr_cli.commands._trained import Trained, open_trained
@@ -14,6 +14,7 @@ from gsdmsr_cli.filming.output_files import OutputFiles, file_hash, shots_hash
 from gsdmsr_cli.filming.outputs import ColourRange, find_colour_range
 from gsdmsr_cli.filming.request import Request
 from gsdmsr_cli.filming.sizes import sized
+from gsdmsr_cli.ground import say
 from gsdmsr_cli.paths import make_film
 from gsdmsr_cli.scene.film import Film, PathOptions
 
@@ -48,6 +49,7 @@ def run(run_folder: Path, request: Request, out: Path | None, data: Path | None 
         for files in outputs:
             files.prepare(replaceable=out is None, anew=request.overwrite)
         prepared.append((film, outputs, colours))
+    drawn = []
     for film, outputs, colours in prepared:
         with progress_bar(f"drawing {film.name}") as on_progress:
             timings = draw_film(
@@ -59,7 +61,9 @@ def run(run_folder: Path, request: Request, out: Path | None, data: Path | None 
                 request.supersample,
                 on_progress,
             )
-        _report(film, outputs, request, timings)
+        drawn.append((film, outputs, timings))
+    document = {"films": [_document(*one, request) for one in drawn]}
+    say.result(document, *(line for one in drawn for line in _lines(*one, request)))
 
 
 def _film(trained: Trained, path: str, request: Request) -> Film:
@@ -93,14 +97,37 @@ def _output_files(
     return OutputFiles(output, target, name, count, size, {**origin, **asked, **shown}, film.fps)
 
 
-def _report(film: Film, outputs: list[OutputFiles], request: Request, timings: Timings) -> None:
-    console = Console()
+def _document(
+    film: Film, outputs: list[OutputFiles], timings: Timings, request: Request
+) -> dict[str, Any]:
+    return {
+        "path": film.name,
+        "outputs": [
+            {
+                "output": files.output,
+                "folder": str(files.folder),
+                "frames": files.count,
+                "size": list(files.size),
+                "videos": [str(files.video(kind)) for kind in request.videos],
+            }
+            for files in outputs
+        ],
+        "drawn": timings.drawn,
+        "kept": timings.kept,
+        "drawing_s": round(timings.drawing, 3),
+        "elapsed_s": round(timings.elapsed, 3),
+    }
+
+
+def _lines(
+    film: Film, outputs: list[OutputFiles], timings: Timings, request: Request
+) -> Iterator[str]:
     for files in outputs:
         videos = " and ".join(str(files.video(kind)) for kind in request.videos)
         beside = f"{videos} and {files.count} pictures beside it"
         text = beside if videos else f"{files.count} pictures to {files.folder}"
-        console.out(f"wrote {text}", highlight=False)
-    console.out(_spent(film, timings), highlight=False)
+        yield f"wrote {text}"
+    yield _spent(film, timings)
 
 
 def _spent(film: Film, timings: Timings) -> str:

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from rich.console import Console
 
 from gsdmsr_cli import raster
 from gsdmsr_cli.backends.cpu.jit import set_threads, threads
@@ -20,7 +19,7 @@ from gsdmsr_cli.commands._choice import Choice, Chosen
 from gsdmsr_cli.commands._progress import progress_bar
 from gsdmsr_cli.commands._training_display import TrainingDisplay
 from gsdmsr_cli.formats import read_scene
-from gsdmsr_cli.ground import machine
+from gsdmsr_cli.ground import machine, say
 from gsdmsr_cli.ground.errors import UsageError
 from gsdmsr_cli.ground.files import write_json
 from gsdmsr_cli.ground.locks import sole_writer
@@ -105,16 +104,16 @@ def run(
             processes = len(trainer.workers)
             with TrainingDisplay() as display:
                 finished = train(trainer, folder, display.show)
-        _write_account(folder, trainer, where, timings, processes)
+        account = _write_account(folder, trainer, where, timings, processes)
     _say_end(folder, trainer, data, finished)
     if not finished:
         raise KeyboardInterrupt
+    say.result({"run": str(folder.root), "preset": folder.name, "reason": folder.reason, **account})
 
 
 def _say_preset(chosen: Chosen) -> None:
     if chosen.reason is not None:
-        text = f"{chosen.reason}; --preset names another"
-        Console(stderr=True).out(text, highlight=False)
+        say.note(f"{chosen.reason}; --preset names another")
 
 
 def _require_precision(options: Preset, wanted: str, device: str) -> None:
@@ -221,8 +220,8 @@ def _require_rest(earlier: Run, options: Preset, checkpoint: Checkpoint) -> None
 
 def _write_account(
     folder: Run, trainer: Trainer, device: str, timings: dict[str, float], processes: int
-) -> None:
-    """Write what the training took, the budget's share and what lies outside it."""
+) -> dict[str, Any]:
+    """Write, and return, what the training took, the budget's share and what lies outside it."""
     clock = trainer.clock
     account = {
         "schema": SCHEMA,
@@ -240,6 +239,7 @@ def _write_account(
         "versions": machine.versions(),
     }
     write_json(folder.training_path, account)
+    return account
 
 
 def _say_end(folder: Run, trainer: Trainer, data: Path, finished: bool) -> None:
@@ -248,4 +248,4 @@ def _say_end(folder: Run, trainer: Trainer, data: Path, finished: bool) -> None:
     if not finished:
         again = ("gsdmsr", "train", "--data", str(data), "--out", str(folder.root), "--resume")
         text = f"interrupted at step {steps}; continue with: {shlex.join(again)}"
-    Console(stderr=True).out(text, highlight=False)
+    say.note(text)

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
@@ -15,6 +13,7 @@ from gsdmsr_cli.commands._progress import progress_bar
 from gsdmsr_cli.evaluation.lpips import NETS, find_weights, hub_folder, load_lpips, search_folders
 from gsdmsr_cli.evaluation.metrics import Missing
 from gsdmsr_cli.evaluation.weights import Fetched, fetch, source
+from gsdmsr_cli.ground import say
 from gsdmsr_cli.ground.errors import DataError, UsageError, nearest
 
 
@@ -22,7 +21,6 @@ def run(
     nets: Sequence[str] = (),
     to: Path | None = None,
     folder: Path | None = None,
-    as_json: bool = False,
 ) -> None:
     """Fetch what is missing of the networks named, then print what is there.
 
@@ -30,7 +28,6 @@ def run(
         nets: networks to fetch; nothing is fetched for others.
         to: folder to fetch into, torch's own if None.
         folder: a folder that is searched before the usual ones.
-        as_json: print one JSON object instead of a table.
 
     Raises:
         UsageError: there is no such network.
@@ -44,11 +41,7 @@ def run(
             if isinstance(found, Missing):
                 _print_fetched(_fetch(net, kind, to or hub_folder()), source(net, kind).url)
     report = examine(folder or (to if nets else None))
-    if as_json:
-        Console().out(json.dumps(report), highlight=False)
-    else:
-        Console().print(_table(report))
-        Console().out(f"looked in: {', '.join(report['searched'])}", highlight=False)
+    say.result(report, _table(report), f"looked in: {', '.join(report['searched'])}")
 
 
 def examine(folder: Path | None = None) -> dict[str, Any]:
@@ -79,8 +72,7 @@ def _fetch(net: str, kind: str, to: Path) -> Fetched:
 
 
 def _print_fetched(fetched: Fetched, url: str) -> None:
-    text = f"fetched {url}: {fetched.size} bytes, SHA-256 {fetched.sha256}, to {fetched.path}"
-    Console(stderr=True).out(text, highlight=False)
+    say.note(f"fetched {url}: {fetched.size} bytes, SHA-256 {fetched.sha256}, to {fetched.path}")
 
 
 def _table(report: dict[str, Any]) -> Table:

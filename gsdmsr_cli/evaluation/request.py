@@ -52,14 +52,12 @@ class Output:
 
     Attributes:
         folder: where to write, if not ``RUN/eval``.
-        as_json: whether stdout gets the document instead of a table.
         junit: file of JUnit XML to write.
         github_summary: whether to append Markdown to the file that GitHub Actions names.
         report: whether to write ``report.html`` and ``report.md`` beside ``metrics.json``.
     """
 
     folder: Path | None = None
-    as_json: bool = False
     junit: Path | None = None
     github_summary: bool = False
     report: bool = False

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 import re
-import sys
 from collections.abc import Callable, Sequence
 from importlib import resources
 from pathlib import Path
@@ -12,6 +11,7 @@ from typing import Any, cast
 
 import yaml
 
+from gsdmsr_cli.ground import say
 from gsdmsr_cli.ground.errors import UsageError, nearest
 from gsdmsr_cli.options.renamed import with_present_names
 from gsdmsr_cli.options.strict import Located
@@ -86,7 +86,7 @@ def _named(name: str | None, own: Located) -> str | None:
 
 @functools.cache  # a command may read its options several times, and says this once
 def _hint(text: str) -> None:
-    print(f"hint: {text}", file=sys.stderr)
+    say.note(f"hint: {text}")
 
 
 def preset_folder() -> Path:

@@ -45,7 +45,7 @@ Gsdmsr = Any  # the fixture of conftest.py
                 Demands(
                     ("psnr=25", "ssim=0.9"), ("lpips_alex=0.1",), Path("b.json"), ("psnr=0.5",)
                 ),
-                Output(Path("o"), True, Path("j.xml"), True, True),
+                Output(Path("o"), Path("j.xml"), True, True),
                 Path("d"),
             ),
         ),
@@ -99,19 +99,19 @@ Gsdmsr = Any  # the fixture of conftest.py
             (Path("r"), "ply", None, None, ["time=0.5", "a=1"], Path("o")),
         ),
         ("demo", "demo", (Path("gsdmsr-demo"),)),
-        ("doctor --json", "doctor", (True,)),
-        ("weights", "weights", ([], None, None, False)),
+        ("doctor --json", "doctor", ()),
+        ("weights", "weights", ([], None, None)),
         (
             "weights --fetch vgg --fetch alex --to o --lpips-weights w --json",
             "weights",
-            (["vgg", "alex"], Path("o"), Path("w"), True),
+            (["vgg", "alex"], Path("o"), Path("w")),
         ),
-        ("benchmark kernels --yardstick y --json", "benchmark_kernels", (Path("y"), "cpu", True)),
-        ("benchmark kernels --device cuda", "benchmark_kernels", (None, "cuda", False)),
+        ("benchmark kernels --yardstick y --json", "benchmark_kernels", (Path("y"), "cpu")),
+        ("benchmark kernels --device cuda", "benchmark_kernels", (None, "cuda")),
         (
             "benchmark scenes a --out o --steps 9",
             "benchmark_scenes",
-            ([Path("a")], Path("o"), ["dnerf"], [9], [0], Terms(1, "white", "test", None), False),
+            ([Path("a")], Path("o"), ["dnerf"], [9], [0], Terms(1, "white", "test", None)),
         ),
         (
             "benchmark scenes a b --out o --preset static --preset dnerf --budget 2m --budget 8m"
@@ -125,7 +125,6 @@ Gsdmsr = Any  # the fixture of conftest.py
                 ["2m", "8m"],
                 [1, 2],
                 Terms(2, "black", "val", Path("w"), 2),
-                True,
             ),
         ),
     ],

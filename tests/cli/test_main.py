@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import json
 import subprocess
 import sys
 import time
@@ -139,14 +140,27 @@ def test_failures_are_one_line_and_their_code(
     failure: Exception, code: int, message: str, gsdmsr: Gsdmsr, capsys: pytest.CaptureFixture[str]
 ) -> None:
     gsdmsr.failure = failure
-    assert gsdmsr("doctor --json") == code
+    assert gsdmsr("doctor") == code
     assert capsys.readouterr() == ("", f"error: {message}\n")
+    assert gsdmsr("doctor --json") == code
+    out, err = capsys.readouterr()
+    kinds = {1: "internal", 2: "usage", 3: "data", 4: "threshold"}
+    assert err == f"error: {message}\n"
+    assert json.loads(out) == {
+        "error": {"kind": kinds[code], "message": message, "exit_code": code}
+    }
 
 
 @pytest.mark.parametrize("failure", [KeyboardInterrupt(), typer.Abort()])
-def test_an_interrupt_exits_130(failure: BaseException, gsdmsr: Gsdmsr) -> None:
+def test_an_interrupt_exits_130(
+    failure: BaseException, gsdmsr: Gsdmsr, capsys: pytest.CaptureFixture[str]
+) -> None:
     gsdmsr.failure = failure
     assert gsdmsr("doctor") == 130
+    assert capsys.readouterr() == ("", "")
+    assert gsdmsr("doctor --json") == 130
+    out, err = capsys.readouterr()
+    assert (json.loads(out)["error"]["kind"], err) == ("interrupted", "")
 
 
 def test_debug_shows_the_traceback(

@@ -13,6 +13,7 @@ import torch
 from gsdmsr_cli import raster
 from gsdmsr_cli.backends.cuda import availability
 from gsdmsr_cli.commands import doctor
+from gsdmsr_cli.ground import say
 
 
 @pytest.fixture(autouse=True)
@@ -23,7 +24,8 @@ def _no_weights(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
 
 
 def test_json_is_one_object_on_stdout(capsys: pytest.CaptureFixture[str]) -> None:
-    doctor.run(as_json=True)
+    with say.on_its_own(as_json=True):
+        doctor.run()
     captured = capsys.readouterr()
     report = json.loads(captured.out)
     assert captured.err == ""
@@ -84,7 +86,7 @@ def test_the_table_shows_reasons_as_they_are_written(
 ) -> None:
     monkeypatch.setattr(doctor, "_engine", lambda _: {"cpu": None, "cuda": "not [bold] here"})
     monkeypatch.setenv("COLUMNS", "200")
-    doctor.run(as_json=False)
+    doctor.run()
     out = capsys.readouterr().out
     assert "engine reference on cuda" in out
     assert "no: not [bold] here" in out
@@ -109,6 +111,6 @@ def test_the_gpu_is_described_or_what_is_missing(
         "cuda": "13.0", "nvrtc": "13.0", "name": "Some [Card]", "memory_mib": 81920,
         "capability": "9.0", "missing": None,
     }  # fmt: skip
-    doctor.run(as_json=False)
+    doctor.run()
     said = "Some [Card], 81920 MiB, compute capability 9.0; torch for CUDA 13.0, NVRTC 13.0"
     assert said in capsys.readouterr().out

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import io
 from dataclasses import replace
+from pathlib import Path
 
+import pytest
 from rich.console import Console
 
 from gsdmsr_cli.commands._training_display import TrainingDisplay, describe
+from gsdmsr_cli.ground import say
 from gsdmsr_cli.training.loop import Report
 
 REPORT = Report(2588, 38.0, 0.63, 0.1, 6574, 1.0, 0.0, 0, 16.6, 29.763, "val", {})
@@ -33,10 +36,24 @@ def shown(reports: int, terminal: bool) -> str:
     return out.getvalue()
 
 
-def test_a_log_gets_one_line_in_twenty_and_the_last() -> None:
-    lines = shown(200, terminal=False).splitlines()
-    assert len(lines) == 20 + 1
+@pytest.mark.parametrize("terminal", [True, False])
+def test_a_log_gets_one_line_in_twenty_and_the_last(
+    terminal: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with say.on_its_own():
+        say.log_to(tmp_path / "log")
+        shown(200, terminal)
+    logged = [line.partition(" ")[2] for line in (tmp_path / "log").read_text().splitlines()]
+    lines = logged if terminal else capsys.readouterr().err.splitlines()
+    assert len(lines) == 20 + 1 and lines == logged
     assert "step 1 " in lines[0] and lines[-1].startswith("100%  step 200 ")
+
+
+def test_quiet_shows_nothing(capsys: pytest.CaptureFixture[str]) -> None:
+    with say.on_its_own():
+        say.speak_up_to(say.WARNINGS)
+        assert shown(3, terminal=True) + shown(3, terminal=False) == ""
+    assert capsys.readouterr() == ("", "")
 
 
 def test_a_terminal_gets_a_bar() -> None:

@@ -10,6 +10,7 @@ import pytest
 
 from gsdmsr_cli.commands import weights
 from gsdmsr_cli.evaluation.weights import Fetched, Source
+from gsdmsr_cli.ground import say
 from gsdmsr_cli.ground.errors import DataError, UsageError
 
 Fetches = list[tuple[str, Path]]
@@ -38,7 +39,8 @@ def fetches(monkeypatch: pytest.MonkeyPatch) -> Fetches:
 
 
 def test_nothing_is_fetched_unasked(fetches: Fetches, capsys: Any, tmp_path: Path) -> None:
-    weights.run(as_json=True)
+    with say.on_its_own(as_json=True):
+        weights.run()
     report = json.loads(capsys.readouterr().out)
     assert report["searched"] == [str(tmp_path / "hub" / "hub" / "checkpoints")]
     for net in ("alex", "squeeze", "vgg"):
@@ -51,7 +53,8 @@ def test_nothing_is_fetched_unasked(fetches: Fetches, capsys: Any, tmp_path: Pat
 
 def test_only_what_is_missing_is_fetched(fetches: Fetches, capsys: Any, tmp_path: Path) -> None:
     to = tmp_path / "to"
-    weights.run(["vgg", "vgg"], to, as_json=True)
+    with say.on_its_own(as_json=True):
+        weights.run(["vgg", "vgg"], to)
     assert fetches == [("vgg16-397923af.pth", to), ("lpips_vgg.pth", to)]
     out, err = capsys.readouterr()
     assert err.count("fetched https://") == 2 and "SHA-256 ab" in err
@@ -62,7 +65,8 @@ def test_only_what_is_missing_is_fetched(fetches: Fetches, capsys: Any, tmp_path
 
 
 def test_they_go_where_every_command_looks(fetches: Fetches, tmp_path: Path, capsys: Any) -> None:
-    weights.run(["squeeze"], as_json=True)
+    with say.on_its_own(as_json=True):
+        weights.run(["squeeze"])
     entry = json.loads(capsys.readouterr().out)["nets"]["lpips_squeeze"]
     hub = tmp_path / "hub" / "hub" / "checkpoints"
     assert entry["trunk"] == str(hub / "squeezenet1_1-b8a52dc0.pth")
@@ -70,7 +74,8 @@ def test_they_go_where_every_command_looks(fetches: Fetches, tmp_path: Path, cap
 
 
 def test_real_weights_are_found_and_load(shared_data: Path, capsys: Any) -> None:
-    weights.run(folder=shared_data / "lpips", as_json=True)
+    with say.on_its_own(as_json=True):
+        weights.run(folder=shared_data / "lpips")
     nets = json.loads(capsys.readouterr().out)["nets"]
     assert nets["lpips_alex"]["reason"] is nets["lpips_squeeze"]["reason"] is None
     assert nets["lpips_vgg"]["linear"].endswith("vgg.pth") and nets["lpips_vgg"]["trunk"] is None
