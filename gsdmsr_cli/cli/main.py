@@ -101,9 +101,7 @@ def _run() -> int:
         code, reason = _call(), lost()
         if reason is not None and code == 0:
             code = DataError.exit_code
-            message = (
-                f"standard output cannot be written: {reason}; what was asked for is not whole"
-            )
+            message = f"standard output cannot be written: {reason}; what was asked for is lost"
             _tell(message, code)
     return code
 

@@ -64,9 +64,7 @@ def run(
         _append(summary_path, markdown(_heading(run_folder), document, verdicts))
     if output.report:
         _report(folder, trained, document, verdicts)
-    say.result(
-        document, *_shown(document, verdicts, folder, output)
-    )  # last: its reader may be gone
+    say.result(document, *_shown(document, verdicts, folder, output))  # last of all
     missed = [verdict.found for verdict in verdicts if not verdict.passed]
     if missed:
         raise ThresholdError("; ".join(missed))
