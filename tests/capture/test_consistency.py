@@ -172,3 +172,9 @@ def test_what_a_turning_camera_explains_is_found(tmp_path: Path) -> None:
         (tmp_path / name).mkdir()
         share = turning_share(write_matches(tmp_path / name, pixels), square)
         assert share == 1.0 if name == "turning" else share < 0.5
+
+
+def test_of_no_matches_nothing_moves_and_nothing_turns(tmp_path: Path) -> None:
+    folder = write_matches(tmp_path, [np.zeros((0, 2))] * FRAMES)
+    assert moving_share(folder, reconstruction()) == 0.0
+    assert turning_share(folder, LENS) == 0.0

@@ -97,6 +97,11 @@ def test_parallax_takes_a_camera_half_way_into_account() -> None:
     )
 
 
+def test_a_point_at_a_camera_has_a_parallax_too() -> None:
+    points = np.concatenate([POINTS[:1] * 0, POINTS[1:]])
+    assert np.isfinite(parallaxes(replace(reconstruction(), points=points))).all()
+
+
 def test_masks_are_told_by_what_they_cover(tmp_path: Path) -> None:
     for i in range(4):
         mask = np.zeros((10, 20, 1), np.uint8)
