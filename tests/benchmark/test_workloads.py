@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from typing import Any
 
 import pytest
@@ -11,6 +12,7 @@ import torch
 from gsdmsr_cli.benchmark import workloads
 from gsdmsr_cli.benchmark.cloud import camera, cloud
 from gsdmsr_cli.gaussians.moment import Moment
+from gsdmsr_cli.ground.geometry import SH_C0
 from gsdmsr_cli.raster import best_engine
 
 
@@ -21,6 +23,22 @@ def test_the_cloud_is_in_the_picture_and_the_same_every_time() -> None:
     frame = best_engine("cpu").rasterize(Moment(splats), camera(64), torch.ones(3))
     assert float((frame.radii > 0).float().mean()) > 0.95
     assert 0.2 < float(frame.alpha.mean()) < 0.9
+
+
+def test_the_cloud_is_made_as_it_says() -> None:
+    """Half of the splats are nearly opaque; colours are colours; sizes fall with the cube root."""
+    splats, more = cloud(4000), cloud(32_000)
+    opacities = splats.logit_opacities.sigmoid()
+    assert float((opacities > 0.8).float().mean()) == pytest.approx(0.5, abs=0.03)
+    assert float(opacities.min()) > 0.02 and float(opacities.max()) < 0.9951
+    colours = 0.5 + SH_C0 * splats.sh[:, 0]
+    assert 0 <= float(colours.min()) < 0.01 and 0.99 < float(colours.max()) <= 1
+    shrunk = more.log_scales.mean() - splats.log_scales.mean()
+    assert float(shrunk) == pytest.approx(-math.log(2), abs=0.03)
+    # the 30 % that lie anywhere fill a ball of 0.9 evenly: within half of it there is an eighth
+    radii = splats.means.norm(dim=1)
+    assert float((radii > 0.9).float().mean()) < 0.1
+    assert float((radii > 0.999).float().mean()) < 0.05
 
 
 def test_drawing_takes_the_gradients_of_all_that_is_stored(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -8,7 +8,6 @@ from pathlib import Path
 FURTHER = {
     "gsdmsr_cli/__": ("tests/cli",),
     "gsdmsr_cli/backends/tensors": ("tests/ops/adam", "tests/ops/planes"),
-    "gsdmsr_cli/benchmark": ("tests/commands/test_chain.py",),
     "gsdmsr_cli/capture": ("tests/commands/test_bad_input.py",),
     "gsdmsr_cli/cli": ("tests/commands",),
     "gsdmsr_cli/commands": ("tests/cli", "tests/benchmark", "tests/runs"),

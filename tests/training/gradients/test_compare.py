@@ -112,6 +112,13 @@ def test_what_does_not_count_may_be_anything(trainer: Trainer) -> None:
     assert torch.equal(one.tile_errors, same.tile_errors)
 
 
+@pytest.mark.parametrize("ssim", [0.01, 1.0])
+def test_tiles_are_not_weighted_where_ssim_counts(trainer: Trainer, ssim: float) -> None:
+    target = trainer.renderer.pictures.load(trainer.views[0])
+    with pytest.raises(ValueError, match="tiles cannot be weighted where SSIM counts"):
+        compared(trainer, target, ssim, None, "cpu", torch.ones(9))
+
+
 @pytest.mark.parametrize("ssim", [0.0, 0.2])
 @pytest.mark.parametrize("engine", ["cpu", "reference"])
 def test_if_all_counts_nothing_changes(trainer: Trainer, ssim: float, engine: str) -> None:

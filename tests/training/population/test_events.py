@@ -55,6 +55,12 @@ def test_events_are_due_when_the_preset_says_so() -> None:
     assert due("stillness", *still, "density.until=0.1") == [40, 60, 80]
 
 
+def test_once_nothing_grows_any_more_splats_are_pruned_every_500_steps() -> None:
+    event = start_events(preset_of("density.until=0.5", "density.start=700"))["density"]
+    asked = [499, 500, 501, 999, 1000, 1001, 1500]
+    assert [step for step in asked if event.due(Tick(step, 0.6))] == [1000, 1500]
+
+
 def test_what_has_happened_is_restored() -> None:
     reset = start_events(preset_of("density.reset_at=[0.1, 0.5]"))["opacity_reset"]
     reset.restore({"count": 1})
