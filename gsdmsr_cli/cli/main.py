@@ -22,6 +22,7 @@ from gsdmsr_cli.cli import (
     doctor,
     export,
     prepare,
+    presets,
     render,
     train,
     weights,
@@ -35,7 +36,9 @@ from gsdmsr_cli.ground.streams import unfailing
 
 # These files import gsdmsr_cli.commands in the functions that run them: torch alone would make
 # --help slow.
-_COMMANDS = (prepare, train, evaluate, render, export, demo, doctor, weights, benchmark)
+_COMMANDS = (
+    prepare, train, evaluate, render, export, demo, presets, doctor, weights, benchmark,
+)  # fmt: skip
 """In the order of --help."""
 
 app = typer.Typer(

@@ -20,6 +20,10 @@ Place = Callable[[int], str]
 """Names where line n (from 1) of a text stands."""
 
 
+_ABOUT = "base", "description"
+"""Keys of a preset that are no options: what it inherits from, and what it is for."""
+
+
 class _Loader(yaml.SafeLoader):  # type: ignore[misc]
     """Safe YAML with the scalars of YAML 1.2: 1e-3 is a number; on, 1:30 and dates are text."""
 
@@ -61,7 +65,7 @@ def resolve(name: str | None, config: Path | None, overrides: Sequence[str]) -> 
     """
     own = read(config) if config else Located()
     preset = _named(name, own) or "default"
-    given = [own.without("base"), read_overrides(overrides)]
+    given = [own.without(*_ABOUT), read_overrides(overrides)]
     asked = [with_present_names(mapping, _hint) for mapping in given]
     return functools.reduce(_merge, [*_chain(preset), *asked])
 
@@ -100,6 +104,26 @@ def preset_names() -> list[str]:
     return sorted(path.stem for path in preset_folder().glob("*.yaml"))
 
 
+def preset_chain(name: str) -> list[str]:
+    """Return the preset and those that it inherits from, the most basic last.
+
+    Raises:
+        UsageError: a preset does not exist or inherits from itself.
+    """
+    _chain(name)  # refuses circles
+    base = _base(_preset(name))
+    return [name, *(preset_chain(base) if base else [])]
+
+
+def purpose(name: str) -> str:
+    """Return what a preset is for, in one line.
+
+    Raises:
+        UsageError: there is no such preset.
+    """
+    return str(_preset(name).get("description", ""))
+
+
 def read(path: Path) -> Located:
     """Read one YAML file that holds a mapping; an empty file is an empty mapping.
 
@@ -125,13 +149,17 @@ def _chain(name: str, above: tuple[str, ...] = ()) -> list[Located]:
     if name in above:
         circle = " -> ".join([*above, name])
         raise UsageError(f"preset '{name}' inherits from itself: {circle}")
+    own = _preset(name)
+    base = _base(own)
+    below = _chain(base, (*above, name)) if base else []
+    return [*below, own.without(*_ABOUT)]
+
+
+def _preset(name: str) -> Located:
     known = preset_names()
     if name not in known:
         raise UsageError(f"unknown preset '{name}'; {nearest(name, known)}")
-    own = read(preset_folder() / f"{name}.yaml")
-    base = _base(own)
-    below = _chain(base, (*above, name)) if base else []
-    return [*below, own.without("base")]
+    return read(preset_folder() / f"{name}.yaml")
 
 
 def _base(mapping: Located) -> str | None:

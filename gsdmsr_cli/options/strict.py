@@ -87,17 +87,18 @@ def build(cls: type[T], mapping: Mapping[str, Any], where: str) -> T:
 def dump(options: DataclassInstance) -> dict[str, Any]:
     """Return the inverse of ``build``: nested plain dicts and lists, fit for JSON and YAML."""
     return {
-        field.name: _plain(getattr(options, field.name)) for field in dataclasses.fields(options)
+        field.name: plain(getattr(options, field.name)) for field in dataclasses.fields(options)
     }
 
 
-def _plain(value: Any) -> Any:
+def plain(value: Any) -> Any:
+    """Return the value of an option as plain JSON."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return dump(value)
     if isinstance(value, Mapping):
-        return {key: _plain(item) for key, item in value.items()}
+        return {key: plain(item) for key, item in value.items()}
     if isinstance(value, tuple | list):
-        return [_plain(item) for item in value]
+        return [plain(item) for item in value]
     return value
 
 
@@ -134,7 +135,7 @@ def _convert_or_fail(value: Any, kind: Any, where: str, name: str) -> Any:
     try:
         return _convert(value, kind)
     except _MismatchError:
-        message = f"{where}: {name} is {_show(value)}; allowed: {_describe(kind)}"
+        message = f"{where}: {name} is {_show(value)}; allowed: {describe_kind(kind)}"
         raise UsageError(message) from None
 
 
@@ -193,20 +194,21 @@ def _convert_tuple(value: Any, kinds: tuple[Any, ...]) -> tuple[Any, ...]:
     return tuple(_convert(item, kind) for item, kind in zip(value, kinds, strict=True))
 
 
-def _describe(kind: Any) -> str:
+def describe_kind(kind: Any) -> str:
+    """Return which values a type of options allows, such as "a whole number or null"."""
     origin, arguments = get_origin(kind), get_args(kind)
     if origin in (Union, UnionType):
-        return " or ".join(_describe(argument) for argument in arguments)
+        return " or ".join(describe_kind(argument) for argument in arguments)
     if origin is Literal:
         return " or ".join(repr(argument) for argument in arguments)
     if origin is tuple and arguments[-1] is Ellipsis:
-        return f"a list, each item {_describe(arguments[0])}"
+        return f"a list, each item {describe_kind(arguments[0])}"
     if origin is tuple:
-        return f"a list of {len(arguments)} items: {', '.join(map(_describe, arguments))}"
+        return f"a list of {len(arguments)} items: {', '.join(map(describe_kind, arguments))}"
     return _NOUNS.get(kind, "a mapping")
 
 
 def _show(value: object) -> str:
     """Return the value as it would be written in a file, shortened to fit a line."""
-    text = json.dumps(_plain(value), default=str, ensure_ascii=False)
+    text = json.dumps(plain(value), default=str, ensure_ascii=False)
     return text if len(text) <= 60 else f"{text[:57]}..."

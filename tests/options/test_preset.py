@@ -52,7 +52,8 @@ def test_every_preset_loads_and_survives_being_dumped(name: str, tmp_path: Path)
 
 def test_the_default_preset_spells_out_every_default() -> None:
     assert load_preset(None, None, []) == Preset()
-    mapping = preset_files.read(preset_files.preset_folder() / "default.yaml")
+    path = preset_files.preset_folder() / "default.yaml"
+    mapping = preset_files.read(path).without("description")
     expected = strict.dump(Preset())
     expected["motion"] = {"name": mapping["motion"]["name"]}
     assert strict.dump(Preset()).keys() == mapping.keys()
