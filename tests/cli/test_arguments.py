@@ -127,6 +127,45 @@ Gsdmsr = Any  # the fixture of conftest.py
                 Terms(2, "black", "val", Path("w"), 2),
             ),
         ),
+        (
+            "benchmark resume s --out o",
+            "benchmark_resume",
+            (
+                Path("s"),
+                Path("o"),
+                "dnerf",
+                ["training.steps=600", "data.downscale=4"],
+                20,
+                0,
+            ),
+        ),
+        (
+            "benchmark resume s --out o --preset n3v --steps 9 --downscale 2 --kills 3 --seed 5"
+            " --set a.b=1",
+            "benchmark_resume",
+            (
+                Path("s"),
+                Path("o"),
+                "n3v",
+                ["training.steps=9", "data.downscale=2", "a.b=1"],
+                3,
+                5,
+            ),
+        ),
+        ("benchmark still r", "benchmark_still", (Path("r"), [0.1, 0.3, 1.0, 3.0], "val", None)),
+        (
+            "benchmark still r --below 0.5 --below 2 --split test --data d",
+            "benchmark_still",
+            (Path("r"), [0.5, 2.0], "test", Path("d")),
+        ),
+        ("benchmark soak -- train --data d", "benchmark_soak", (["train", "--data", "d"], 10.0)),
+        ("benchmark soak --every 2 -- doctor", "benchmark_soak", (["doctor"], 2.0)),
+        ("benchmark reading --out o", "benchmark_reading", (Path("o"), 10_000, 5_000_000)),
+        (
+            "benchmark reading --out o --pictures 5 --points 7",
+            "benchmark_reading",
+            (Path("o"), 5, 7),
+        ),
     ],
 )
 def test_commands_get_typed_arguments(

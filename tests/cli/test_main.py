@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import json
+import signal
 import subprocess
 import sys
 import time
@@ -200,3 +201,16 @@ def test_names_in_any_language_are_printable() -> None:
 
 def test_an_error_is_one_printable_line_whatever_it_names() -> None:
     assert str(DataError("a\nb: \x1b[2J\x07 is\r\n wrong")) == r"a b: \x1b[2J\x07 is wrong"
+
+
+def test_whoever_had_the_signals_before_has_them_afterwards(gsdmsr: Gsdmsr) -> None:
+    names = ("SIGINT", "SIGTERM", "SIGHUP")
+    numbers = [getattr(signal, name) for name in names if hasattr(signal, name)]
+    earlier = [signal.signal(number, lambda *_: None) for number in numbers]
+    try:
+        mine = [signal.getsignal(number) for number in numbers]
+        assert gsdmsr("doctor") == 0
+        assert [signal.getsignal(number) for number in numbers] == mine
+    finally:
+        for number, handler in zip(numbers, earlier, strict=True):
+            signal.signal(number, handler)
