@@ -7,6 +7,9 @@ from collections.abc import Iterable
 
 from gsdmsr_cli.ground.printing import one_line
 
+LONGEST = 2000
+"""Characters of a message; what a file holds may be longer than anybody reads."""
+
 
 class GsdmsrError(Exception):
     """An error whose message is one line: what was found, what is allowed and what to do."""
@@ -14,7 +17,8 @@ class GsdmsrError(Exception):
     exit_code = 1
 
     def __str__(self) -> str:
-        return one_line(super().__str__())
+        text = one_line(super().__str__())
+        return text if len(text) <= LONGEST else f"{text[: LONGEST - 500]} ... {text[-400:]}"
 
 
 class UsageError(GsdmsrError):

@@ -41,6 +41,9 @@ SCHEMA = 2
 tensor were called ``nodes``, and checkpoints counted events otherwise; 1 is converted when read."""
 
 _READ = 1, SCHEMA
+_WRONG = LookupError, TypeError, ValueError, AttributeError, OverflowError, RecursionError
+"""What values of other kinds than were written end in."""
+
 _ABOUT, _LOG, _CHECKPOINT = "run.json", "metrics.jsonl", "checkpoint.safetensors"
 _TRAINING = "training.json"
 
@@ -145,7 +148,7 @@ class Run:
         try:
             *lines, _ = self.log_path.read_text(encoding="utf-8").split("\n")
             return [dict(json.loads(line)) for line in lines]
-        except (OSError, ValueError, TypeError) as error:
+        except (OSError, *_WRONG) as error:
             raise DataError(f"{self.log_path}: cannot be read: {error}") from error
 
     def rewind_log(self, step: int) -> None:
@@ -203,7 +206,7 @@ class Run:
                 tensors,
                 training,
             )
-        except (SafetensorError, OSError, KeyError, TypeError, ValueError) as error:
+        except (SafetensorError, OSError, *_WRONG) as error:
             raise DataError(
                 f"{self.checkpoint_path}: damaged checkpoint: {error}; train again with --overwrite"
             ) from error
@@ -318,7 +321,7 @@ def open_run(root: Path) -> Run:
             str(about["data"]["fingerprint"]),
             about.get("reason"),
         )
-    except (UsageError, LookupError, TypeError, AttributeError) as error:
+    except (UsageError, *_WRONG) as error:
         raise DataError(f"{path}: damaged: {error}") from error
 
 

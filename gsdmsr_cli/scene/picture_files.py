@@ -137,16 +137,19 @@ def _require_bearable(path: Path, spec: OpenImageIO.ImageSpec, kind: str, size: 
 
 
 def _png_fault(file: BinaryIO, thorough: bool) -> str | None:
-    """Return what is wrong with a PNG's chunks: no end marker or, if thorough, a wrong checksum.
+    """Return what is wrong with a PNG's chunks: their order, or, if thorough, a wrong checksum.
 
     The decoder would notice too, but only with the pixels, and libpng then prints to stderr.
     """
-    size = os.fstat(file.fileno()).st_size
+    size, found = os.fstat(file.fileno()).st_size, list[bytes]()
     file.seek(8)
     while len(header := file.read(8)) == 8:
         length, kind = struct.unpack(">I4s", header)
+        if (kind == b"IHDR") != (not found) or (kind == b"IHDR" and length != 13):
+            return "the PNG does not begin with one header"
         if kind == b"IEND":
-            return None
+            return None if b"IDAT" in found else "the PNG has no pixels"
+        found.append(kind)
         end = file.tell() + length + 4
         if end > size:
             break

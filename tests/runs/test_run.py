@@ -171,6 +171,28 @@ def test_a_checkpoint_of_someone_else_is_told(run: Run, header: dict[str, str] |
         run.load()
 
 
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"elapsed": 10**400}, {"step": float("inf")}, {"state": 3}, {"schema": None},
+        {"schema": 1, "state": {"adam_steps": "x", "events": {}}},
+        {"schema": 1, "state": {"adam_steps": {}, "adam_restarts": 1, "events": {}}},
+    ],
+)  # fmt: skip
+def test_a_checkpoint_with_values_of_other_kinds_is_told(run: Run, change: dict[str, Any]) -> None:
+    state = {"schema": 2, "step": 1, "progress": 0.1, "elapsed": 1, "state": {}} | change
+    header = {"gsdmsr": json.dumps(state)}
+    runs.save_file({"weight": torch.ones(2)}, run.checkpoint_path, metadata=header)
+    with pytest.raises(DataError, match="damaged checkpoint"):
+        run.load()
+
+
+def test_a_log_that_is_nested_too_deeply_is_told(run: Run) -> None:
+    run.log_path.write_text("[" * 100_000 + "\n")
+    with pytest.raises(DataError, match=r"metrics\.jsonl: cannot be read"):
+        run.read_log()
+
+
 def test_a_run_without_a_checkpoint_is_told(run: Run) -> None:
     with pytest.raises(DataError, match="no checkpoint yet; train it again with --overwrite"):
         run.load()
