@@ -61,7 +61,7 @@ def measure(trained: Trained, request: Request) -> dict[str, Any]:
         "backgrounds": {name: _results(scored[name], metrics) for name in others},
         "speed": speed.document(),
         "storage": {
-            "checkpoint_bytes": trained.run.checkpoint_path.stat().st_size,
+            "checkpoint_bytes": trained.checkpoint.file_bytes,
             **protocol.storage(trained.checkpoint.tensors),
         },
         "training": _training(trained),
@@ -118,6 +118,7 @@ def describe(trained: Trained, request: Request) -> dict[str, Any]:
         "background": _backgrounds(trained, request)[0],
         "checkpoint": "last",
         "checkpoint_step": checkpoint.step,
+        "checkpoint_sha256": checkpoint.sha256,
         "progress": checkpoint.progress,
         "device": trained.device,
         "processor": machine.cpu_name(),

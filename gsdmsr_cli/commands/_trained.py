@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,8 +13,10 @@ from gsdmsr_cli import raster
 from gsdmsr_cli.evaluation.protocol import ViewRenderer
 from gsdmsr_cli.formats import read_scene
 from gsdmsr_cli.ground.errors import DataError
+from gsdmsr_cli.ground.locks import one_of_readers
+from gsdmsr_cli.model.model import Model
 from gsdmsr_cli.options.preset import BACKGROUNDS
-from gsdmsr_cli.runs.run import Checkpoint, Run, open_run
+from gsdmsr_cli.runs.run import Checkpoint, Run, open_with_model
 from gsdmsr_cli.scene.pictures import Pictures
 from gsdmsr_cli.scene.scene import Scene
 
@@ -36,10 +40,11 @@ class Trained:
     device: str
 
 
+@contextmanager
 def open_trained(
     folder: Path, data: Path | None, background: str | None = None, downscale: int | None = None
-) -> Trained:
-    """Open a run with its data.
+) -> Iterator[Trained]:
+    """Open a run with its data, which nobody replaces until the end of the block.
 
     Args:
         folder: the run folder.
@@ -50,18 +55,25 @@ def open_trained(
     Raises:
         DataError: the run or its data cannot be used, or do not belong together.
     """
+    run, model, checkpoint = open_with_model(folder)
+    with one_of_readers(data or run.data):
+        scene = _read_data(run, data)
+        renderer, device = _renderer(run, model, background, downscale)
+        yield Trained(run, checkpoint, scene, renderer, device)
+
+
+def _renderer(
+    run: Run, model: Model, background: str | None, downscale: int | None
+) -> tuple[ViewRenderer, str]:
+    """Return what draws a model, and where."""
     # torch's own threads would wait busily between its small operations and take the kernels' cores
     torch.set_num_threads(1)
-    run = open_run(folder)
-    model, checkpoint = run.load_model()
-    scene = _read_data(run, data)
     options = run.preset.data
     colour = BACKGROUNDS[background or options.background]
     pictures = Pictures(colour, downscale or options.downscale, options.cache_mib << 20)
     device = raster.pick_device("auto")
     behind = torch.tensor(colour).to(device)
-    renderer = ViewRenderer(model.to(device), raster.best_engine(device), pictures, behind)
-    return Trained(run, checkpoint, scene, renderer, device)
+    return ViewRenderer(model.to(device), raster.best_engine(device), pictures, behind), device
 
 
 def _read_data(run: Run, data: Path | None) -> Scene:

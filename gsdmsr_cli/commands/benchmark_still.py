@@ -37,7 +37,13 @@ def run(run_folder: Path, below: Sequence[float], split: str, data: Path | None)
     for threshold in below:
         if not threshold > 0:
             raise UsageError(f"--below {threshold}: must be above 0")
-    trained = open_trained(run_folder, data)
+    with open_trained(run_folder, data) as trained:
+        rows = _measure(trained, below, split)
+    say.result({"schema": SCHEMA, "split": split, "rows": rows}, _table(rows, split))
+
+
+def _measure(trained: Trained, below: Sequence[float], split: str) -> list[dict[str, Any]]:
+    """Return a row of the table for each threshold, and first one without."""
     views = trained.scene.split(split)
     camera = trained.renderer.pictures.camera(views[0])
     saliency, mean = motion_saliency(trained.renderer.model, camera)
@@ -47,7 +53,8 @@ def run(run_folder: Path, below: Sequence[float], split: str, data: Path | None)
         change = let_stand_still(models[threshold], saliency < threshold, mean)
         resize_model(models[threshold], change)
     speeds = _speeds(trained, models, views)
-    rows, total = [], len(models) * len(views)
+    rows: list[dict[str, Any]] = []
+    total = len(models) * len(views)
     with progress_bar("comparing pictures") as on_progress:
         for number, (threshold, model) in enumerate(models.items()):
             renderer, before = replace(trained.renderer, model=model), number * len(views)
@@ -61,7 +68,7 @@ def run(run_folder: Path, below: Sequence[float], split: str, data: Path | None)
                     "ratio": speeds[threshold] / speeds[0.0],
                 }
             )
-    say.result({"schema": SCHEMA, "split": split, "rows": rows}, _table(rows, split))
+    return rows
 
 
 def _speeds(

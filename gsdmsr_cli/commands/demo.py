@@ -13,6 +13,7 @@ from gsdmsr_cli.evaluation.request import Output
 from gsdmsr_cli.filming.request import Request
 from gsdmsr_cli.ground import say
 from gsdmsr_cli.ground.errors import DataError, UsageError
+from gsdmsr_cli.ground.locks import sole_writer
 
 BUDGET = "60s"
 """Wall time of the training; with everything else the demo stays under 3 minutes on 2 cores."""
@@ -26,13 +27,13 @@ def run(out: Path) -> None:
 
     Raises:
         UsageError: ``out`` is a file, or a folder with something else in it.
-        DataError: ``out`` cannot be written.
+        DataError: ``out`` cannot be written, or another process writes there.
     """
     _claim(out)
     scene, run_folder = out / "scene", out / "run"
-    _write_scene(scene)
-    overrides = [f"training.budget={BUDGET}"]
-    with say.parts() as answers:
+    with sole_writer(out), say.parts() as answers:
+        _write_scene(scene)
+        overrides = [f"training.budget={BUDGET}"]
         train.run(scene, run_folder, "dnerf", None, overrides, "auto", False, run_folder.exists())
         evaluate.run(run_folder, None, None, Output(report=True))
         render.run(run_folder, Request(), None)
@@ -56,7 +57,7 @@ def _claim(out: Path) -> None:
 
 
 def _write_scene(folder: Path) -> None:
-    with progress_bar("drawing the scene") as on_progress:
+    with sole_writer(folder), progress_bar("drawing the scene") as on_progress:
         write_scene(folder, progress=on_progress)
 
 

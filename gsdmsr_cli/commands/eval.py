@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
+from contextlib import ExitStack
 from pathlib import Path
 
 from rich.markup import escape
@@ -20,6 +21,7 @@ from gsdmsr_cli.evaluation.summary import Document
 from gsdmsr_cli.ground import say
 from gsdmsr_cli.ground.errors import DataError, ThresholdError, UsageError
 from gsdmsr_cli.ground.files import require_folder, write_json, write_text
+from gsdmsr_cli.ground.locks import sole_writer
 from gsdmsr_cli.reporting.frames import make_report_frames
 from gsdmsr_cli.reporting.page import page
 
@@ -48,22 +50,24 @@ def run(
         raise UsageError("--junit has nothing to tell of: give a threshold or a --baseline")
     summary_path = _summary_path() if output.github_summary else None
     background = None if request.background == BOTH else request.background
-    trained = open_trained(run_folder, data, background, request.downscale)
-    protocol, folder = describe(trained, request), output.folder or run_folder / "eval"
-    if gates.baseline:
-        gates.baseline.require_same(protocol)
-    require_folder(folder)
-    if output.junit:
-        require_folder(output.junit.parent)
-    document = measure(trained, request)
-    verdicts = gates.judge(document)
-    write_json(folder / "metrics.json", document)
-    if output.junit:
-        write_text(output.junit, junit("gsdmsr.eval", document, verdicts))
-    if summary_path:
-        _append(summary_path, markdown(_heading(run_folder), document, verdicts))
-    if output.report:
-        _report(folder, trained, document, verdicts)
+    with ExitStack() as held:
+        given = run_folder, data, background, request.downscale
+        trained = held.enter_context(open_trained(*given))
+        protocol, folder = describe(trained, request), output.folder or run_folder / "eval"
+        if gates.baseline:
+            gates.baseline.require_same(protocol)
+        held.enter_context(sole_writer(folder))
+        if output.junit:
+            require_folder(output.junit.parent)
+        document = measure(trained, request)
+        verdicts = gates.judge(document)
+        write_json(folder / "metrics.json", document)
+        if output.junit:
+            write_text(output.junit, junit("gsdmsr.eval", document, verdicts))
+        if summary_path:
+            _append(summary_path, markdown(_heading(run_folder), document, verdicts))
+        if output.report:
+            _report(folder, trained, document, verdicts)
     say.result(document, *_shown(document, verdicts, folder, output))  # last of all
     missed = [verdict.found for verdict in verdicts if not verdict.passed]
     if missed:

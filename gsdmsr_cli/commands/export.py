@@ -12,7 +12,7 @@ from gsdmsr_cli.commands._progress import progress_bar
 from gsdmsr_cli.ground import say
 from gsdmsr_cli.options.preset_files import read_overrides
 from gsdmsr_cli.options.strict import Located
-from gsdmsr_cli.runs.run import open_run
+from gsdmsr_cli.runs.run import open_with_model
 
 
 def run(
@@ -39,8 +39,7 @@ def run(
         DataError: the run cannot be used, or ``out`` not be written.
     """
     settings = _settings(time, frames, overrides)
-    folder = open_run(run_folder)
-    model, _ = folder.load_model()
+    folder, model, _ = open_with_model(run_folder)
     with progress_bar("writing splats") as on_progress, torch.no_grad():
         written = exports.export(format_, model, folder.facts, settings, out, on_progress)
     count, splats = len(written), len(model.splats)

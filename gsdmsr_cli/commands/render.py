@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -10,11 +11,13 @@ from gsdmsr_cli.commands._progress import progress_bar
 from gsdmsr_cli.commands._trained import Trained, open_trained
 from gsdmsr_cli.filming.draw_film import Timings, draw_film
 from gsdmsr_cli.filming.encode import require_encoder
-from gsdmsr_cli.filming.output_files import OutputFiles, file_hash, shots_hash
+from gsdmsr_cli.filming.output_files import OutputFiles, shots_hash
 from gsdmsr_cli.filming.outputs import ColourRange, find_colour_range
 from gsdmsr_cli.filming.request import Request
 from gsdmsr_cli.filming.sizes import sized
 from gsdmsr_cli.ground import say
+from gsdmsr_cli.ground.files import require_folder
+from gsdmsr_cli.ground.locks import one_of_readers, sole_writer
 from gsdmsr_cli.paths import make_film
 from gsdmsr_cli.scene.film import Film, PathOptions
 
@@ -37,16 +40,25 @@ def run(run_folder: Path, request: Request, out: Path | None, data: Path | None 
     """
     for kind in request.videos:
         require_encoder(kind)
-    trained = open_trained(run_folder, data)
+    with ExitStack() as held:
+        trained = held.enter_context(open_trained(run_folder, data))
+        _draw(trained, request, out, held)
+
+
+def _draw(trained: Trained, request: Request, out: Path | None, held: ExitStack) -> None:
+    """Draw all films, whose folders are ``held`` meanwhile."""
     films = [_film(trained, path, request) for path in ([request.path] if request.path else USUAL)]
-    target, origin = out or run_folder / "render", _origin(trained, request)
+    target, origin = out or trained.run.root / "render", _origin(trained, request)
     prepared = []
+    require_folder(target)
+    held.enter_context(one_of_readers(target))
     for film in films:
         colours = find_colour_range(trained.renderer, film.shots, request.outputs)
         outputs = [
             _output_files(film, output, target, origin, colours) for output in request.outputs
         ]
         for files in outputs:
+            held.enter_context(sole_writer(files.folder))
             files.prepare(replaceable=out is None, anew=request.overwrite)
         prepared.append((film, outputs, colours))
     drawn = []
@@ -79,7 +91,7 @@ def _origin(trained: Trained, request: Request) -> dict[str, object]:
     """Return what frames depend on besides their film, for the JSON file beside them."""
     return {
         "run": str(trained.run.root),
-        "checkpoint_sha256": file_hash(trained.run.checkpoint_path),
+        "checkpoint_sha256": trained.checkpoint.sha256,
         "background": trained.renderer.background.tolist(),
         "supersample": request.supersample,
     }

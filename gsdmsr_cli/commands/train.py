@@ -22,10 +22,11 @@ from gsdmsr_cli.formats import read_scene
 from gsdmsr_cli.ground import machine, say
 from gsdmsr_cli.ground.errors import UsageError
 from gsdmsr_cli.ground.files import write_json
-from gsdmsr_cli.ground.locks import sole_writer
+from gsdmsr_cli.ground.locks import one_of_readers, sole_writer
 from gsdmsr_cli.options import strict
 from gsdmsr_cli.options.preset import BACKGROUNDS, Preset, load_preset
 from gsdmsr_cli.runs.run import (
+    OUTPUTS,
     SCHEMA,
     Checkpoint,
     Run,
@@ -74,12 +75,16 @@ def run(
         if earlier is None:
             options = choice.check()  # an error now rather than after the data has been read
             refuse_used(out, overwrite)
+            for name in OUTPUTS:
+                if (out / name).is_dir():  # which goes with the run, but not from under a writer
+                    locks.enter_context(sole_writer(out / name))
         else:
             options = _resumed_options(earlier, preset, config, overrides)
             checkpoint = earlier.load()
             _require_rest(earlier, options, checkpoint)
         where = raster.pick_device(device)
         _require_precision(options, device, where)
+        locks.enter_context(one_of_readers(data))
         scene, load_s = _timed(lambda: _read(data))
         if earlier is not None:
             earlier.check_scene(scene)

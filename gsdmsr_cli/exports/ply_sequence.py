@@ -3,17 +3,27 @@
 from __future__ import annotations
 
 import re
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
+from gsdmsr_cli import __version__
 from gsdmsr_cli.exports import Facts
 from gsdmsr_cli.exports._ply import lost_at, splats_at, write_ply
 from gsdmsr_cli.ground.errors import DataError, UsageError
+from gsdmsr_cli.ground.files import leftovers, read_json, write_json
+from gsdmsr_cli.ground.locks import sole_writer
 from gsdmsr_cli.ground.progress import OnProgress
 from gsdmsr_cli.model.model import Model
 from gsdmsr_cli.options.strict import require
 
 PREFIX = "frame"
+
+NOTE = "ply-sequence.json"
+"""Names the frames that have been written here, which another export may replace."""
+
+PART = ".ply-sequence.part"
+"""Folder for frames until all have been written."""
 
 
 @dataclass(frozen=True)
@@ -58,24 +68,54 @@ def write(
     """Write frame0001.ply, frame0002.ply, ... into the folder ``out``, in the order of time.
 
     The moments are those of ``options.moments()``. Viewers such as SuperSplat play every file of
-    the prefix, so frames left from a longer sequence are refused rather than mixed in.
+    the prefix, so frames of anything else are refused rather than mixed in or replaced. Frames
+    appear together, after the last has been written.
 
     Raises:
-        DataError: ``out`` is a file or holds other frames, a splat holds NaN or infinity, or a
-            file cannot be written.
+        DataError: ``out`` is a file or holds other frames, another process writes there, a splat
+            holds NaN or infinity, or a file cannot be written.
     """
     moments = options.moments()
     digits = max(4, len(str(len(moments))))
-    paths = [out / f"{PREFIX}{i:0{digits}d}.ply" for i in range(1, len(moments) + 1)]
-    _refuse_leftovers(out, paths)
-    for done, (path, time) in enumerate(zip(paths, moments, strict=True), start=1):
-        write_ply(path, splats_at(model, time))
-        on_progress(done, len(paths))
-    return paths
+    names = [f"{PREFIX}{i:0{digits}d}.ply" for i in range(1, len(moments) + 1)]
+    _refuse_others(out, names)
+    with sole_writer(out):
+        _refuse_others(out, names)
+        part = out / PART
+        try:
+            _remove(part)
+            for done, (name, time) in enumerate(zip(names, moments, strict=True), start=1):
+                write_ply(part / name, splats_at(model, time))
+                on_progress(done, len(names))
+            _move_up(part, out, names)
+        finally:
+            _remove(part)
+    return [out / name for name in names]
 
 
-def _refuse_leftovers(folder: Path, paths: list[Path]) -> None:
-    """Raise DataError if ``folder`` is no folder or holds frames besides ``paths``."""
+def _move_up(part: Path, out: Path, names: list[str]) -> None:
+    """Move all frames to their places, and say which are there and when all of them are."""
+    note = {"gsdmsr": __version__, "whole": False, "frames": names}
+    write_json(out / NOTE, note)
+    try:
+        for name in names:
+            (part / name).replace(out / name)
+    except OSError as error:
+        reason = error.strerror or error
+        raise DataError(f"{out}: cannot be written: {reason}; free space") from error
+    write_json(out / NOTE, note | {"whole": True})
+
+
+def _remove(part: Path) -> None:
+    """Remove the folder of frames that have not been moved up, but nothing else in it."""
+    with suppress(OSError):
+        for path in (*part.glob(f"{PREFIX}*.ply"), *leftovers(part)):
+            path.unlink()
+        part.rmdir()
+
+
+def _refuse_others(folder: Path, names: list[str]) -> None:
+    """Raise DataError if ``folder`` is no folder or holds frames that are not to be replaced."""
     try:
         present = {path.name for path in folder.iterdir()}
     except FileNotFoundError:
@@ -84,8 +124,17 @@ def _refuse_leftovers(folder: Path, paths: list[Path]) -> None:
         reason = error.strerror or error
         raise DataError(f"cannot use {folder}: {reason}; --out must name a folder") from error
     frames = {name for name in present if re.fullmatch(rf"{PREFIX}\d+\.ply", name)}
-    if others := sorted(frames - {path.name for path in paths}):
+    own = set(_noted(folder)) & set(names)
+    if others := sorted(frames - own):
         raise DataError(
             f"{folder} holds {len(others)} frames of another sequence, {others[0]} the first; "
             "empty it or choose another --out"
         )
+
+
+def _noted(folder: Path) -> list[str]:
+    """Return the frames that an earlier export has written there, by its note."""
+    if not (folder / NOTE).is_file():
+        return []
+    note = read_json(folder / NOTE)
+    return list(map(str, note.get("frames", []))) if "gsdmsr" in note else []

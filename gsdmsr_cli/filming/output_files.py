@@ -164,8 +164,3 @@ def shots_hash(shots: Sequence[Shot]) -> str:
         line = [camera.world_to_camera.tolist(), lens, shot.time, picture]
         digest.update(json.dumps(line).encode())
     return digest.hexdigest()
-
-
-def file_hash(path: Path) -> str:
-    """Return the SHA-256 of a file."""
-    return hashlib.sha256(path.read_bytes()).hexdigest()

@@ -20,6 +20,7 @@ from gsdmsr_cli.formats import _checks as checks
 from gsdmsr_cli.formats import _world
 from gsdmsr_cli.formats._arrays import read_npy
 from gsdmsr_cli.ground.errors import DataError
+from gsdmsr_cli.ground.locks import in_turn
 from gsdmsr_cli.ground.progress import OnProgress
 from gsdmsr_cli.scene.camera import Camera
 from gsdmsr_cli.scene.imaging import image_size, resize_area, write_png
@@ -35,6 +36,8 @@ FRAME_RATE = 30.0
 """Of all videos of the data set [1 / s]."""
 
 _PART = ".part"
+_STALE = re.compile(rf"\.images\.[0-9a-f]{{32}}{re.escape(_PART)}")
+"""What a killed process leaves of a video that it was decoding."""
 
 
 def matches(folder: Path) -> bool:
@@ -118,21 +121,28 @@ def _frames_of(folder: Path, camera: str) -> Path:
 
 
 def _decode(video: Path, target: Path, count: Callable[[], None]) -> None:
-    """Write the frames of a video as PNG files below ``target``, which appears whole."""
-    beside = target.with_name(f".{target.name}.{uuid.uuid4().hex}{_PART}")
-    try:
-        for stale in target.parent.glob(f".{target.name}.*{_PART}"):
-            shutil.rmtree(stale, ignore_errors=True)
-        beside.mkdir(parents=True)
-        for i, (_, picture) in enumerate(read_video(video)):
-            write_png(beside / f"{i:04d}.png", _halved(picture))
-            count()
-        beside.replace(target)
-    except OSError as error:
-        reason = error.strerror or error
-        raise DataError(f"{target}: cannot be written: {reason}; is the disk full?") from error
-    finally:
-        shutil.rmtree(beside, ignore_errors=True)
+    """Write the frames of a video as PNG files below ``target``, which appears whole.
+
+    Of several processes one decodes, and the others wait for what it has decoded.
+    """
+    with in_turn(target.parent):
+        if target.is_dir():
+            return
+        beside = target.with_name(f".{target.name}.{uuid.uuid4().hex}{_PART}")
+        try:
+            for stale in target.parent.iterdir():
+                if _STALE.fullmatch(stale.name):
+                    shutil.rmtree(stale, ignore_errors=True)
+            beside.mkdir()
+            for i, (_, picture) in enumerate(read_video(video)):
+                write_png(beside / f"{i:04d}.png", _halved(picture))
+                count()
+            beside.replace(target)
+        except OSError as error:
+            reason = error.strerror or error
+            raise DataError(f"{target}: cannot be written: {reason}; is the disk full?") from error
+        finally:
+            shutil.rmtree(beside, ignore_errors=True)
 
 
 def _halved(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:

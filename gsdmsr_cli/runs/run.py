@@ -11,6 +11,7 @@ earlier one. The folder can be moved; nothing in it is pickled.
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import shutil
@@ -20,7 +21,8 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors import SafetensorError, safe_open
+from safetensors import SafetensorError
+from safetensors.torch import load as load_tensors
 from safetensors.torch import save_file
 from torch import Tensor
 
@@ -48,6 +50,10 @@ _ABOUT, _LOG, _CHECKPOINT = "run.json", "metrics.jsonl", "checkpoint.safetensors
 _TRAINING = "training.json"
 
 
+OUTPUTS = "eval", "render"
+"""Folders in that of a run which the commands of these names write, if told no other."""
+
+
 @dataclass(frozen=True)
 class Checkpoint:
     """A moment of the training.
@@ -58,6 +64,8 @@ class Checkpoint:
         elapsed: wall time of training so far [s].
         tensors: the model's, and the optimiser's as far as the caller saved them.
         state: everything else that a resumed training needs, plain JSON.
+        sha256: of the file that it was read from; empty where it was not.
+        file_bytes: size of that file.
     """
 
     step: int
@@ -65,6 +73,8 @@ class Checkpoint:
     elapsed: float
     tensors: dict[str, Tensor]
     state: dict[str, Any]
+    sha256: str = ""
+    file_bytes: int = 0
 
 
 @dataclass(frozen=True)
@@ -191,9 +201,9 @@ class Run:
                 f"{self.root}: the run has no checkpoint yet; train it again with --overwrite"
             )
         try:
-            with safe_open(self.checkpoint_path, framework="pt") as file:
-                state = json.loads((file.metadata() or {})["gsdmsr"])
-                tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+            data = self.checkpoint_path.read_bytes()  # at once: a training may replace the file
+            state = json.loads(_metadata(data)["gsdmsr"])
+            tensors = load_tensors(data)
             training = dict(state["state"])
             if int(state["schema"]) < SCHEMA:
                 motion = str(self.preset.motion["name"])
@@ -205,6 +215,8 @@ class Run:
                 float(state["elapsed"]),
                 tensors,
                 training,
+                hashlib.sha256(data).hexdigest(),
+                len(data),
             )
         except (SafetensorError, OSError, *_WRONG) as error:
             raise DataError(
@@ -323,6 +335,33 @@ def open_run(root: Path) -> Run:
         )
     except (UsageError, *_WRONG) as error:
         raise DataError(f"{path}: damaged: {error}") from error
+
+
+def open_with_model(root: Path) -> tuple[Run, Model, Checkpoint]:
+    """Open a run folder and read the model of its last checkpoint, both of one training.
+
+    A training may go on there, or another begin: then they are read again.
+
+    Raises:
+        DataError: see ``open_run`` and ``Run.load_model``.
+    """
+    run, found = open_run(root), None
+    while found is None:
+        try:
+            found = run.load_model()
+        except DataError:
+            if open_run(root) == run:
+                raise
+        before, run = run, open_run(root)
+        if run != before:
+            found = None
+    return run, *found
+
+
+def _metadata(data: bytes) -> dict[str, str]:
+    """Return what the header of a safetensors file says beside its tensors."""
+    length = int.from_bytes(data[:8], "little")
+    return dict(json.loads(data[8 : 8 + length])["__metadata__"])
 
 
 def _clear(root: Path) -> None:

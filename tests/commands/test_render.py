@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +24,7 @@ from gsdmsr_cli.filming import draw_film
 from gsdmsr_cli.formats import read_scene
 from gsdmsr_cli.options.preset import load_preset
 from gsdmsr_cli.raster import best_engine
-from gsdmsr_cli.runs.run import create_run
+from gsdmsr_cli.runs.run import create_run, open_run
 from gsdmsr_cli.scene.imaging import image_size, read_exr, read_image
 from gsdmsr_cli.scene.native import load_av
 from gsdmsr_cli.scene.pictures import Pictures
@@ -184,13 +185,16 @@ def test_only_frames_that_show_the_same_are_kept(
 
 
 def test_frames_of_another_checkpoint_are_drawn_anew(
-    run: Path, render: Render, tmp_path: Path, capsys: Any, monkeypatch: Any
+    run: Path, render: Render, tmp_path: Path, capsys: Any
 ) -> None:
     assert render("--path orbit --frames 3") == 0
     capsys.readouterr()
-    monkeypatch.setattr("gsdmsr_cli.commands.render.file_hash", lambda _: "another")
+    opened = open_run(run)
+    before = opened.checkpoint_path.read_bytes()
+    opened.save(replace(opened.load(), step=1))
     assert render("--path orbit --frames 3") == 0
     assert frames_drawn(capsys) == 3
+    opened.checkpoint_path.write_bytes(before)
 
 
 def test_a_damaged_frame_is_drawn_again(render: Render, tmp_path: Path, capsys: Any) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import json
 import re
 import subprocess
 import sys
@@ -262,7 +263,9 @@ def test_sequence_spreads_its_frames_over_time(tmp_path: Path) -> None:
     model, told = falling(make_splats(3, 0)), []
     paths = write("ply-sequence", model, tmp_path / "run", told, frames=5)
     assert [path.name for path in paths] == [f"frame000{i}.ply" for i in range(1, 6)]
-    assert sorted((tmp_path / "run").iterdir()) == paths
+    assert sorted((tmp_path / "run").glob("*.ply")) == paths
+    note = json.loads((tmp_path / "run" / "ply-sequence.json").read_text())
+    assert note["frames"] == [path.name for path in paths] and note["whole"]
     for path, time in zip(paths, (0.0, 0.25, 0.5, 0.75, 1.0), strict=True):
         assert torch.equal(read_ply(path).means, splats_at(model, time).means)
     assert told == [(i, 5) for i in range(1, 6)]
@@ -282,6 +285,35 @@ def test_sequence_refuses_to_mix_with_a_longer_one(tmp_path: Path) -> None:
     write("ply-sequence", model, tmp_path, frames=4)
     with pytest.raises(DataError, match=r"2 frames of another sequence, frame0003\.ply"):
         write("ply-sequence", model, tmp_path, frames=2)
+
+
+def test_sequence_leaves_frames_of_somebody_else_alone(tmp_path: Path) -> None:
+    model = falling(make_splats(2, 0))
+    (tmp_path / "frame0001.ply").write_text("mine")
+    with pytest.raises(DataError, match=r"1 frames of another sequence, frame0001\.ply"):
+        write("ply-sequence", model, tmp_path, frames=2)
+    assert [path.name for path in tmp_path.iterdir()] == ["frame0001.ply"]
+    assert (tmp_path / "frame0001.ply").read_text() == "mine"
+
+
+def test_a_sequence_on_a_full_disk_leaves_the_one_before(tmp_path: Path, monkeypatch: Any) -> None:
+    """And a folder without one has none then, not the first frames."""
+    before = write("ply-sequence", falling(make_splats(2, 0)), tmp_path / "a", frames=4)
+    content, real, count = [path.read_bytes() for path in before], Path.write_bytes, [0]
+
+    def fill(path: Path, data: bytes) -> int:
+        count[0] += 1
+        if not count[0] % 3:
+            raise OSError(28, "No space left on device")
+        return real(path, data)
+
+    monkeypatch.setattr(Path, "write_bytes", fill)
+    for name in ("a", "b"):
+        with pytest.raises(DataError, match="No space left"):
+            write("ply-sequence", falling(make_splats(3, 1)), tmp_path / name, frames=4)
+        count[0] = 0
+    assert [path.read_bytes() for path in before] == content
+    assert not any((tmp_path / "b").iterdir()) and len(list((tmp_path / "a").iterdir())) == 5
 
 
 def test_sequence_refuses_a_file_and_no_frames(tmp_path: Path) -> None:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -107,7 +109,7 @@ def test_an_interrupted_decoding_leaves_nothing_that_looks_finished(
         read_scene(folder)
     assert sorted(p.name for p in (folder / "cam00").iterdir()) == ["images"]
     assert not list((folder / "cam01").iterdir())
-    stale = folder / "cam01" / ".images.123.part"  # as a killed process leaves it
+    stale = folder / "cam01" / f".images.{'12' * 16}.part"  # as a killed process leaves it
     stale.mkdir()
     monkeypatch.setattr(neural3d, "write_png", write)
     assert len(read_scene(folder).views) == CAMERAS * FRAMES
@@ -161,3 +163,28 @@ def test_other_videos_are_no_cameras(tmp_path: Path) -> None:
     write_picture(tmp_path / "images" / "a.png", noise(4, 4))
     with pytest.raises(DataError, match="has no known layout"):
         read_scene(tmp_path)
+
+
+def test_two_readers_at_once_decode_every_video_once(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One waits for the other; each then has all frames."""
+    real, decoded = neural3d.read_video, list[str]()
+
+    def read(path: Path) -> Any:
+        decoded.append(path.name)
+        time.sleep(0.05)
+        return real(path)
+
+    monkeypatch.setattr(neural3d, "read_video", read)
+    with ThreadPoolExecutor(2) as pool:
+        scenes = list(pool.map(read_scene, [folder, folder]))
+    assert [len(scene.views) for scene in scenes] == [CAMERAS * FRAMES] * 2
+    assert sorted(decoded) == [f"cam{i:02d}.mp4" for i in range(CAMERAS)]
+
+
+def test_a_folder_of_somebody_else_beside_the_frames_is_left_alone(folder: Path) -> None:
+    mine = folder / "cam00" / ".images.mine.part"
+    mine.mkdir(parents=True)
+    read_scene(folder)
+    assert mine.is_dir()
