@@ -78,10 +78,11 @@ def _random(*shape: int, seed: int = 0) -> Tensor:
 
 
 def _grids(device: str, dtype: torch.dtype) -> list[Tensor]:
-    """Return the tensors of two levels, with temporal planes that are not 1."""
+    """Return the tensors of two levels, with temporal planes that are neither 1 nor smooth."""
     rng = torch.Generator().manual_seed(0)
     levels = [planes.new_level(4, 3, 32, rng), planes.new_level(9, 5, 16, rng)]
-    moved = [level.space for level in levels], [level.time + 0.3 for level in levels]
+    times = [level.time + 0.3 * torch.randn(level.time.shape, generator=rng) for level in levels]
+    moved = [level.space for level in levels], times
     return _leaves(device, dtype, *(part for pair in zip(*moved, strict=True) for part in pair))
 
 

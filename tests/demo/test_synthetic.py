@@ -172,3 +172,23 @@ def test_progress_counts_every_picture(tmp_path: Path) -> None:
     told: list[tuple[int, int]] = []
     write_scene(tmp_path, 16, 2, 1, 1, progress=lambda done, total: told.append((done, total)))
     assert told == [(1, 4), (2, 4), (3, 4), (4, 4)]
+
+
+@pytest.mark.parametrize("time", [0.0, 0.1, 0.25, 0.5, 0.85])
+def test_the_solids_move_as_told(time: float) -> None:
+    """A ball that bounces twice, a box that turns where it stands, a pendulum that swings once."""
+    disc, bouncing, box, pendulum = synthetic.solids_at(time)
+    np.testing.assert_allclose(disc.position, [0, 0, synthetic.FLOOR])
+    share = 2 * time % 1  # of a bounce: a parabola of height 0.75
+    height = 0.75 * (1 - (2 * share - 1) ** 2)
+    resting = synthetic.FLOOR + synthetic.BALL_RADIUS
+    np.testing.assert_allclose(bouncing.position, [-0.55, -0.35, resting + height])
+    np.testing.assert_allclose(box.position, [0.55, -0.4, synthetic.FLOOR + 0.35])
+    turn, swing = 0.3 + 2.1 * time, 0.6 * math.sin(2 * math.pi * time)
+    np.testing.assert_allclose(
+        box.rotation @ [1, 0, 0], [math.cos(turn), math.sin(turn), 0], atol=1e-12
+    )
+    pivot = np.array([0.0, 0.55, 0.9])
+    rod = 0.95 * np.array([-math.sin(swing), 0.0, -math.cos(swing)])
+    np.testing.assert_allclose(pendulum.position, pivot + rod, atol=1e-12)
+    np.testing.assert_allclose(pendulum.rotation @ [0, 0, -0.95], rod, atol=1e-12)

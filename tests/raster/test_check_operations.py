@@ -91,6 +91,22 @@ def test_displacing_that_passes_on_wrong_gradients(monkeypatch: pytest.MonkeyPat
     assert complaint() == "displacing splats makes wrong gradients of deformations of test values"
 
 
+@pytest.mark.parametrize("forgotten", range(3))
+def test_a_penalty_without_one_of_its_terms(
+    monkeypatch: pytest.MonkeyPatch, forgotten: int
+) -> None:
+    right = check.planes.penalty
+
+    def penalty(levels: Any, *weights: float) -> Tensor:
+        given = list(weights)
+        if levels[0].space.dtype is torch.float32:
+            given[forgotten] = 0.0
+        return right(levels, *given)
+
+    monkeypatch.setattr(check.planes, "penalty", penalty)
+    assert complaint() == "the penalty of plane grids makes wrong values of test values"
+
+
 @pytest.mark.parametrize("name", ["float32", "bf16", "fp16"])
 def test_networks_of_every_format(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
     right, dtype = network.apply_network, precision.FORMATS[name]

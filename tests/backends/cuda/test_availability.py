@@ -11,6 +11,7 @@ import torch
 
 from gsdmsr_cli import raster
 from gsdmsr_cli.backends.cuda import availability, launch
+from gsdmsr_cli.gaussians.frame import Frame
 from gsdmsr_cli.gaussians.moment import Moment
 from gsdmsr_cli.ground.errors import DataError, GsdmsrError
 from gsdmsr_cli.ops.rasterize.cuda import room
@@ -74,6 +75,26 @@ def test_a_gpu_that_draws_otherwise_is_not_relied_on(machine: pytest.MonkeyPatch
 
 def test_a_healthy_engine_agrees_with_the_reference() -> None:
     assert _check.disagreement(cpu.rasterize, cpu.compare, "cpu") is None
+
+
+def mistaken(name: str) -> Callable[..., Frame]:
+    """Return an engine that takes one of the stored tensors for half, but learns it rightly."""
+
+    def draw(moment: Moment, *rest: Any) -> Frame:
+        tensor = getattr(moment.splats, name)
+        off = 0.5 * tensor.detach()
+        if name == "sh":
+            off[:, 0] = 0  # the constant part is as it should be
+        wrong = replace(moment.splats, **{name: tensor - off})
+        return cpu.rasterize(replace(moment, splats=wrong), *rest)
+
+    return draw
+
+
+@pytest.mark.parametrize("name", ["means", "log_scales", "logit_opacities", "sh"])
+def test_an_engine_that_mistakes_any_of_the_stored_tensors_is_found_out(name: str) -> None:
+    said = _check.disagreement(mistaken(name), cpu.compare, "cpu")
+    assert said == "the picture of a test drawing is wrong"
 
 
 @pytest.mark.usefixtures("kernels_on_the_cpu")
