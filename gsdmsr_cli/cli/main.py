@@ -21,6 +21,7 @@ from gsdmsr_cli.cli import (
     demo,
     doctor,
     export,
+    info,
     prepare,
     presets,
     render,
@@ -37,7 +38,7 @@ from gsdmsr_cli.ground.streams import unfailing
 # These files import gsdmsr_cli.commands in the functions that run them: torch alone would make
 # --help slow.
 _COMMANDS = (
-    prepare, train, evaluate, render, export, demo, presets, doctor, weights, benchmark,
+    prepare, train, evaluate, render, export, info, demo, presets, doctor, weights, benchmark,
 )  # fmt: skip
 """In the order of --help."""
 

@@ -133,7 +133,7 @@ def read_gates(demands: Demands) -> Gates:
     for metric, value in tolerances.items():
         if value < 0:
             raise UsageError(f"--tolerance {metric}={value:g}: allowed: 0 or more")
-    return Gates(bounds, Baseline(path, _read_report(path), tolerances))
+    return Gates(bounds, Baseline(path, read_report(path), tolerances))
 
 
 def _threshold(option: str, text: str, less: bool) -> Threshold:
@@ -158,7 +158,12 @@ def _number(option: str, text: str) -> tuple[str, float]:
     return metric, number
 
 
-def _read_report(path: Path) -> dict[str, Any]:
+def read_report(path: Path) -> dict[str, Any]:
+    """Return a report of ``gsdmsr eval``.
+
+    Raises:
+        DataError: the file cannot be read, or is no report with numbers.
+    """
     document = read_json(path)
     if not all(isinstance(document.get(key), dict) for key in ("protocol", "aggregate")):
         raise DataError(f"{path}: is not a report of eval; give a metrics.json that it has written")

@@ -13,7 +13,14 @@ from gsdmsr_cli.ground.printing import printable
 from gsdmsr_cli.ground.progress import OnProgress
 from gsdmsr_cli.scene.scene import Scene
 
-__all__ = ["Suited", "read_scene", "recognised", "suited_preset"]
+__all__ = [
+    "Suited",
+    "layout_of",
+    "needs_preparing",
+    "read_scene",
+    "recognised",
+    "suited_preset",
+]
 
 
 def read_scene(folder: Path, on_progress: OnProgress = lambda done, total: None) -> Scene:
@@ -22,8 +29,8 @@ def read_scene(folder: Path, on_progress: OnProgress = lambda done, total: None)
     A format is a module of this package with ``SIGN: str``, the files that it is recognised by, for
     messages; ``matches(folder: Path) -> bool``; and ``read(folder: Path) -> Scene``, which raises
     DataError. It may have ``prepare(folder: Path, on_progress: OnProgress)``, which does what is
-    needed only once, such as decoding videos; and ``PRESET``, the preset for its scenes where none
-    is named, if that does not follow from their cameras.
+    needed only once, such as decoding videos, with ``is_prepared(folder: Path) -> bool``; and
+    ``PRESET``, the preset for its scenes where none is named, if their cameras do not tell.
 
     Args:
         folder: of the capture.
@@ -43,8 +50,22 @@ def read_scene(folder: Path, on_progress: OnProgress = lambda done, total: None)
 
 def recognised(folder: Path) -> bool:
     """Return whether the folder has a layout that ``read_scene`` knows."""
-    names = plugins.names(__name__)
-    return folder.is_dir() and any(plugins.load(__name__, n).matches(folder) for n in names)
+    return layout_of(folder) is not None
+
+
+def layout_of(folder: Path) -> str | None:
+    """Return the name of the format that ``read_scene`` would read the folder with, or None."""
+    names = plugins.names(__name__) if folder.is_dir() else []
+    return next((n for n in names if plugins.load(__name__, n).matches(folder)), None)
+
+
+def needs_preparing(folder: Path) -> bool:
+    """Return whether ``read_scene`` would write into a folder of known layout."""
+    layout = layout_of(folder)
+    if layout is None:
+        return False
+    module = plugins.load(__name__, layout)
+    return hasattr(module, "prepare") and not module.is_prepared(folder)
 
 
 def _read(folder: Path, on_progress: OnProgress) -> Scene:

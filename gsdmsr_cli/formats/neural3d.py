@@ -45,6 +45,11 @@ def matches(folder: Path) -> bool:
     return (folder / "poses_bounds.npy").is_file() and bool(_cameras(folder))
 
 
+def is_prepared(folder: Path) -> bool:
+    """Return whether the frames of all videos are there."""
+    return all(_frames_of(folder, name).is_dir() for name in _cameras(folder))
+
+
 def prepare(folder: Path, on_progress: OnProgress) -> None:
     """Decode the videos whose frames are not there yet, each to all of its frames or none.
 
