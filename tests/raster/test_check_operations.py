@@ -153,8 +153,8 @@ def test_a_driver_that_fails_is_told_of(monkeypatch: pytest.MonkeyPatch) -> None
 
     monkeypatch.setitem(launch.runners, "cpu", Failing())
     assert complaint() == (
-        "reading plane grids fails on test values: the NVIDIA driver failed when launching collapse "
-        "no image (209)"
+        "reading plane grids fails on test values: "
+        "the NVIDIA driver failed when launching collapse no image (209)"
     )
 
 
