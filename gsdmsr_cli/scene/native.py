@@ -21,7 +21,7 @@ def load_pycolmap() -> Any:
 
 
 def load_av() -> Any:
-    """Return PyAV, whose libraries are loaded only for those who write videos."""
+    """Return PyAV, whose libraries are loaded only for those who read or write videos."""
     import av
 
     return av

@@ -14,6 +14,7 @@ from collections.abc import Callable
 from contextlib import redirect_stderr
 from dataclasses import dataclass
 from functools import partial
+from itertools import chain, pairwise
 from pathlib import Path
 
 import mutations
@@ -155,7 +156,7 @@ def _panoptic(folder: Path) -> list[Target]:
     at[2, 3] = 4.0
     many = {"fn": names, "k": [[pinhole] * 2] * 2, "w2c": [[at.tolist()] * 2] * 2}
     write_json(scene / "train_meta.json", {"w": 10, "h": 8} | many)
-    for name in sum(names, []):
+    for name in chain.from_iterable(names):
         write_picture(scene / "ims" / name, noise(8, 10, 3))
         write_picture(scene / "seg" / name, noise(8, 10, 1))
     np.savez(scene / "init_pt_cld.npz", data=np.random.default_rng(0).random((30, 7)))
@@ -278,17 +279,19 @@ def _pictures(folder: Path) -> list[Target]:
     ]  # fmt: skip
 
 
+def _directory(rows: list[tuple[int, int, int, int]]) -> bytes:
+    """Return a directory of TIFF: tags, their types, counts and values or places."""
+    return struct.pack("<H", len(rows)) + b"".join(struct.pack("<HHII", *row) for row in rows)
+
+
 def _exif() -> bytes:
     """Return the part of a JPEG file that says how and when it was taken."""
     text = b"2026:01:02 03:04:05\0"
     own = [(0x9003, 2, len(text), 64), (0x9291, 2, 3, int.from_bytes(b"25\0", "little")),
            (0xA405, 3, 1, 28)]  # fmt: skip
     main = [(0x0112, 3, 1, 6), (0x8769, 4, 1, 26 + 12)]
-    pack = lambda rows: (
-        struct.pack("<H", len(rows)) + b"".join(struct.pack("<HHII", *row) for row in rows)
-    )
-    tiff = b"II*\0" + struct.pack("<I", 8) + pack(main) + struct.pack("<I", 0)
-    tiff += pack([(tag, kind, count, at if tag != 0x9003 else len(tiff) + 42)
+    tiff = b"II*\0" + struct.pack("<I", 8) + _directory(main) + struct.pack("<I", 0)
+    tiff += _directory([(tag, kind, count, at if tag != 0x9003 else len(tiff) + 42)
                   for tag, kind, count, at in own]) + struct.pack("<I", 0) + text  # fmt: skip
     content = b"Exif\0\0" + tiff
     return b"\xff\xe1" + struct.pack(">H", len(content) + 2) + content
@@ -298,7 +301,7 @@ def _videos(folder: Path) -> list[Target]:
     def read(path: Path) -> None:
         video_length(path)
         times = [time for time, _ in read_video(path)]
-        assert all(later > time for time, later in zip(times, times[1:], strict=False))
+        assert all(later > time for time, later in pairwise(times))
 
     found = []
     for suffix, codec in ((".mp4", "mp4v"), (".webm", "VP90")):
