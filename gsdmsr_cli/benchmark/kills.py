@@ -15,7 +15,8 @@ from torch import Tensor
 
 from gsdmsr_cli.benchmark.calls import call
 from gsdmsr_cli.ground.errors import DataError, GsdmsrError
-from gsdmsr_cli.runs.run import Checkpoint, is_run, open_run
+from gsdmsr_cli.runs.checkpoints import Checkpoint
+from gsdmsr_cli.runs.run import is_run, open_run
 
 OFTEN = "training.checkpoint_minutes=0.02"
 """A checkpoint a second, so that kills fall into the writing of one as well."""

@@ -48,6 +48,9 @@ def train(
     threads: Annotated[
         int | None, typer.Option(metavar="N", help="CPU threads; 0 takes all cores.")
     ] = None,
+    keep: Annotated[
+        int | None, typer.Option(metavar="N", help="How many of the last checkpoints to keep.")
+    ] = None,
     resume: Annotated[
         bool, typer.Option("--resume", help="Go on from RUN's last checkpoint.")
     ] = False,
@@ -67,6 +70,7 @@ def train(
         "data.background": background,
         "training.seed": seed,
         "training.threads": threads,
+        "training.keep": keep,
     }
     overrides = [*(set_ or []), *_overrides(options)]
     command.run(data, out, preset, config, overrides, device, resume, overwrite)

@@ -16,7 +16,8 @@ from gsdmsr_cli.ground.errors import DataError
 from gsdmsr_cli.ground.locks import one_of_readers
 from gsdmsr_cli.model.model import Model
 from gsdmsr_cli.options.preset import BACKGROUNDS
-from gsdmsr_cli.runs.run import Checkpoint, Run, open_with_model
+from gsdmsr_cli.runs.checkpoints import Checkpoint
+from gsdmsr_cli.runs.run import Run, open_with_model
 from gsdmsr_cli.scene.pictures import Pictures
 from gsdmsr_cli.scene.scene import Scene
 

@@ -11,6 +11,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from gsdmsr_cli.commands._measure import describe, measure
+from gsdmsr_cli.commands._results import EVALUATION, METRICS, REPORTS
 from gsdmsr_cli.commands._trained import Trained, open_trained
 from gsdmsr_cli.evaluation import summary
 from gsdmsr_cli.evaluation.gates import Verdict, read_gates
@@ -53,7 +54,7 @@ def run(
     with ExitStack() as held:
         given = run_folder, data, background, request.downscale
         trained = held.enter_context(open_trained(*given))
-        protocol, folder = describe(trained, request), output.folder or run_folder / "eval"
+        protocol, folder = describe(trained, request), output.folder or run_folder / EVALUATION
         if gates.baseline:
             gates.baseline.require_same(protocol)
         held.enter_context(sole_writer(folder))
@@ -61,7 +62,7 @@ def run(
             require_folder(output.junit.parent)
         document = measure(trained, request)
         verdicts = gates.judge(document)
-        write_json(folder / "metrics.json", document)
+        write_json(folder / METRICS, document)
         if output.junit:
             write_text(output.junit, junit("gsdmsr.eval", document, verdicts))
         if summary_path:
@@ -86,8 +87,8 @@ def _report(
     views, frames = trained.scene.split(document["protocol"]["split"]), document["frames"]
     shown, full = make_report_frames(trained.renderer, views, frames)
     html = page(root.resolve().name, document, verdicts, trained.run.read_log(), shown, full)
-    write_text(folder / "report.md", markdown(_heading(root), document, verdicts))
-    write_text(folder / "report.html", html)
+    write_text(folder / REPORTS[0], markdown(_heading(root), document, verdicts))
+    write_text(folder / REPORTS[1], html)
 
 
 def _summary_path() -> Path:
@@ -110,8 +111,8 @@ def _shown(
 ) -> list[Table | str]:
     """Return the document for people."""
     lines = [f"{'passed' if v.passed else 'FAILED'}: {v.found}" for v in verdicts]
-    lines += [f"written to {folder / 'metrics.json'}"]
-    lines += [f"report: {folder / 'report.html'}"] if output.report else []
+    lines += [f"written to {folder / METRICS}"]
+    lines += [f"report: {folder / REPORTS[1]}"] if output.report else []
     return [_table(document), *lines]
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from gsdmsr_cli.commands._progress import progress_bar
+from gsdmsr_cli.commands._results import FILMS
 from gsdmsr_cli.commands._trained import Trained, open_trained
 from gsdmsr_cli.filming.draw_film import Timings, draw_film
 from gsdmsr_cli.filming.encode import require_encoder
@@ -48,7 +49,7 @@ def run(run_folder: Path, request: Request, out: Path | None, data: Path | None 
 def _draw(trained: Trained, request: Request, out: Path | None, held: ExitStack) -> None:
     """Draw all films, whose folders are ``held`` meanwhile."""
     films = [_film(trained, path, request) for path in ([request.path] if request.path else USUAL)]
-    target, origin = out or trained.run.root / "render", _origin(trained, request)
+    target, origin = out or trained.run.root / FILMS, _origin(trained, request)
     prepared = []
     require_folder(target)
     held.enter_context(one_of_readers(target))

@@ -17,6 +17,7 @@ from gsdmsr_cli.backends.cpu.jit import set_threads, threads
 from gsdmsr_cli.backends.cuda import availability
 from gsdmsr_cli.commands._choice import Choice, Chosen
 from gsdmsr_cli.commands._progress import progress_bar
+from gsdmsr_cli.commands._results import remove_results
 from gsdmsr_cli.commands._training_display import TrainingDisplay
 from gsdmsr_cli.formats import read_scene
 from gsdmsr_cli.ground import machine, say
@@ -25,10 +26,10 @@ from gsdmsr_cli.ground.files import write_json
 from gsdmsr_cli.ground.locks import one_of_readers, sole_writer
 from gsdmsr_cli.options import strict
 from gsdmsr_cli.options.preset import BACKGROUNDS, Preset, load_preset
+from gsdmsr_cli.runs.checkpoints import Checkpoint
 from gsdmsr_cli.runs.run import (
     OUTPUTS,
     SCHEMA,
-    Checkpoint,
     Run,
     continue_run,
     create_run,
@@ -44,6 +45,7 @@ from gsdmsr_cli.training.warm_up import warm_up, warm_up_motion
 
 MAY_CHANGE = (
     "training.budget", "training.steps", "training.threads", "training.checkpoint_minutes",
+    "training.keep",
     "data.cache_mib",
 )  # fmt: skip
 """Options that a resumed training may have otherwise: its length, and what changes no result."""
@@ -80,7 +82,9 @@ def run(
                     locks.enter_context(sole_writer(out / name))
         else:
             options = _resumed_options(earlier, preset, config, overrides)
-            checkpoint = earlier.load()
+            checkpoint, damage = earlier.load_whole()
+            if damage:
+                _warn(damage)
             _require_rest(earlier, options, checkpoint)
         where = raster.pick_device(device)
         _require_precision(options, device, where)
@@ -99,6 +103,8 @@ def run(
                 locks.enter_context(sole_writer(out))  # made now: bad data leaves no empty folder
             if earlier is None:
                 about = chosen.name, options, trainer.facts, scene
+                if overwrite:
+                    remove_results(out)
                 folder = create_run(out, *about, overwrite, chosen.reason)
                 folder.save(trainer.checkpoint())  # a full disk is an error now, not at the end
             else:
@@ -108,7 +114,7 @@ def run(
             timings["compile_s"] = _start_work(trainer, where)
             processes = len(trainer.workers)
             with TrainingDisplay() as display:
-                finished = train(trainer, folder, display.show)
+                finished = train(trainer, folder, display.show, _warn)
         account = _write_account(folder, trainer, where, timings, processes)
     _say_end(folder, trainer, data, finished)
     if not finished:
@@ -245,6 +251,10 @@ def _write_account(
     }
     write_json(folder.training_path, account)
     return account
+
+
+def _warn(text: str) -> None:
+    say.warn(f"warning: {text}")
 
 
 def _say_end(folder: Run, trainer: Trainer, data: Path, finished: bool) -> None:

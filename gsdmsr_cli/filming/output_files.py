@@ -18,12 +18,13 @@ from gsdmsr_cli import __version__
 from gsdmsr_cli.filming.outputs import CHANNELS
 from gsdmsr_cli.filming.request import VIDEOS
 from gsdmsr_cli.ground.errors import DataError
-from gsdmsr_cli.ground.files import leftovers, read_json, write_json
+from gsdmsr_cli.ground.files import read_json, remove_if_empty, remove_leftovers, write_json
 from gsdmsr_cli.scene.film import Shot
 from gsdmsr_cli.scene.imaging import image_size
 
 SCHEMA = 1
 _KINDS = ("png", "openexr")
+_ORIGIN = ".film.json"
 _FRAME = re.compile(r"\d{4,}\.(?:png|exr)")
 
 
@@ -61,7 +62,7 @@ class OutputFiles:
     @property
     def origin(self) -> Path:
         """Where the JSON file is that says what the frames depend on."""
-        return self.target / f"{self.name}.film.json"
+        return self.target / f"{self.name}{_ORIGIN}"
 
     def video(self, kind: str) -> Path:
         """Where the video of a kind is."""
@@ -104,13 +105,27 @@ class OutputFiles:
                 self._remove_frames()
             if kept.get("fps") != self.fps:
                 self._remove_videos()
-            for left in [*leftovers(self.folder), *self.target.glob(f".{self.name}.*.part.*")]:
-                left.unlink()
+            remove_leftovers(self.folder)
+            for kind in VIDEOS:
+                remove_leftovers(self.target, self.video(kind).name)
         except OSError as error:
             raise DataError(
                 f"{self.folder}: cannot be written: {error.strerror or error}"
             ) from error
         write_json(self.origin, self._document())
+
+    def remove(self) -> None:
+        """Remove the film, and its folder if nothing else lies there.
+
+        Raises:
+            OSError: something cannot be removed.
+        """
+        self._remove_videos()
+        if self.folder.is_dir() and not self.folder.is_symlink():
+            self._remove_frames()
+            remove_leftovers(self.folder)
+            remove_if_empty(self.folder)
+        self.origin.unlink()
 
     def _read_origin(self) -> dict[str, Any] | None:
         """Return what the JSON file says, None if there is none."""
@@ -147,6 +162,28 @@ class OutputFiles:
     def _document(self) -> dict[str, Any]:
         about = {"schema": SCHEMA, "gsdmsr": __version__, "output": self.output}
         return {**about, **self.request, "fps": self.fps}
+
+
+def remove_films(target: Path) -> None:
+    """Remove what ``render`` has written into a folder: the films that have a JSON file of ours.
+
+    Raises:
+        OSError: something cannot be removed.
+    """
+    for origin in sorted(target.glob(f"*{_ORIGIN}")):
+        name = origin.name.removesuffix(_ORIGIN)
+        files = OutputFiles("rgb", target, name, 0, (0, 0), {}, 0.0)
+        if _is_ours(origin):
+            files.remove()
+    remove_if_empty(target)
+
+
+def _is_ours(origin: Path) -> bool:
+    """Return whether a JSON file says that it is of gsdmsr."""
+    try:
+        return "gsdmsr" in read_json(origin)
+    except DataError:
+        return False
 
 
 def _of_frames(document: Mapping[str, Any]) -> dict[str, Any]:

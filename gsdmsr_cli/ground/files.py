@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import errno
+import hashlib
 import json
 import os
-import uuid
+import re
+import secrets
+import shutil
+import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -12,23 +17,36 @@ from typing import Any
 
 from gsdmsr_cli.ground.errors import DataError
 
-_PART = ".part"
+_OURS = re.compile(r"\.gsdmsr-([0-9a-f]{16})[0-9a-f]{16}\.part(\.[^/]*)?")
+"""Names of what is being written: a hash of the name that it is to get, and a random number."""
+
+_REFUSALS = errno.EINVAL, errno.ENOTSUP, errno.EACCES, errno.EPERM
+"""What drives answer that cannot flush a folder, or whose folders cannot be read."""
 
 
 @contextmanager
-def replacing(path: Path) -> Iterator[Path]:
+def replacing(path: Path, durable: bool = True) -> Iterator[Path]:
     """Yield a path beside ``path``, with its suffix, that takes its place if the block succeeds.
 
-    So a file is whole or as it was. What a killed process has left behind is found by
-    ``leftovers``.
+    So a file is whole or as it was, and has the rights that the umask gives. What a killed process
+    has left behind is removed by ``remove_leftovers``.
+
+    Args:
+        path: the file.
+        durable: whether it must be on the disk when the block is over, so that not even a loss of
+            power takes it back. This costs a few milliseconds; a picture of a film may go without.
 
     Raises:
         DataError: the file cannot be written, or the block has raised OSError.
     """
-    beside = path.with_name(f".{path.stem}.{uuid.uuid4().hex}{_PART}{path.suffix}")
+    beside = _beside(path)
     try:
         yield beside
+        if durable:
+            _flush(beside)
         beside.replace(path)
+        if durable:
+            _flush(path.parent)
     except OSError as error:
         reason = error.strerror or error
         raise DataError(f"{path}: cannot be written: {reason}; is the disk full?") from error
@@ -37,9 +55,85 @@ def replacing(path: Path) -> Iterator[Path]:
             beside.unlink()
 
 
-def leftovers(folder: Path) -> list[Path]:
-    """Return the unfinished files in ``folder``, ours and those of safetensors."""
-    return [*folder.glob(f".*{_PART}*"), *folder.glob(".tmp*")]
+@contextmanager
+def written_apart(path: Path) -> Iterator[Path]:
+    """Yield a path in a folder of its own, beside ``path``, to which the file is moved in the end.
+
+    For libraries that write to further files, or with other rights than those that the umask gives.
+    """
+    folder = _beside(path)
+    folder.mkdir()
+    try:
+        (folder / "rights").touch()
+        yield folder / path.name
+        (folder / path.name).chmod((folder / "rights").stat().st_mode)
+        (folder / path.name).replace(path)
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def _beside(path: Path) -> Path:
+    """Return a path for what is to become ``path``; its length does not depend on that name's."""
+    number = _hash_of(path.name) + secrets.token_hex(8)
+    return path.with_name(f".gsdmsr-{number}.part{path.suffix}")
+
+
+def _hash_of(name: str) -> str:
+    return hashlib.sha256(os.fsencode(name)).hexdigest()[:16]
+
+
+def _flush(path: Path) -> None:
+    """Have a file, or the names in a folder, written to the disk."""
+    folder = path.is_dir()
+    if folder and sys.platform == "win32":
+        return  # folders cannot be opened there
+    try:
+        descriptor = os.open(path, os.O_RDONLY if folder else os.O_RDWR)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
+    except OSError as error:
+        if not folder or error.errno not in _REFUSALS:
+            raise
+
+
+def leftovers(folder: Path, name: str | None = None) -> list[Path]:
+    """Return what killed processes have left unfinished in ``folder``, nobody else's files.
+
+    Args:
+        folder: where nobody is writing now.
+        name: of the file that was being written; all if None.
+    """
+    found = [(path, _OURS.fullmatch(path.name)) for path in folder.iterdir()]
+    return [
+        path
+        for path, match in found
+        if match is not None and (name is None or match[1] == _hash_of(name))
+    ]
+
+
+def remove_leftovers(folder: Path, name: str | None = None) -> None:
+    """Remove what killed processes have left unfinished in ``folder``; see ``leftovers``.
+
+    Raises:
+        OSError: something cannot be removed.
+    """
+    for left in leftovers(folder, name):
+        if left.is_dir() and not left.is_symlink():
+            shutil.rmtree(left)
+        else:
+            left.unlink()
+
+
+def remove_if_empty(folder: Path) -> None:
+    """Remove a folder unless there is something in it.
+
+    Raises:
+        OSError: it cannot be removed for another reason.
+    """
+    if folder.is_dir() and not any(folder.iterdir()):
+        folder.rmdir()
 
 
 def write_json(path: Path, document: Mapping[str, Any]) -> None:

@@ -123,6 +123,7 @@ class TrainingOptions:
         low_resolution_until: progress up to which pictures of half the size are drawn; 0 is never.
         average_from: progress from which the result is the mean of the steps' values; 1 is never.
         checkpoint_minutes: time between checkpoints [min].
+        keep: how many of the last checkpoints are kept.
         seed: seed of every random choice.
         threads: number of CPU threads; 0 takes all cores.
         precision: what the motion's grids and networks are read and computed in on a GPU; values
@@ -138,12 +139,13 @@ class TrainingOptions:
     low_resolution_until: float = 0.3
     average_from: float = 0.9
     checkpoint_minutes: float = 2.0
+    keep: int = 1
     seed: int = 0
     threads: int = 0
     precision: Literal["float32", "bf16", "fp16"] = "float32"
 
     def __post_init__(self) -> None:
-        _require_at_least(self, 1, "steps")
+        _require_at_least(self, 1, "steps", "keep")
         # the limit of a GPU is that of the CPU as well: a training may go on on the other
         within = 1 <= self.views_per_step <= MOST_VIEWS
         require(self, "views_per_step", within, f"1 to {MOST_VIEWS}")

@@ -3,6 +3,7 @@
     RUN/run.json          preset, facts of the scene, where the data lay, versions
     RUN/metrics.jsonl     one line per report of the training
     RUN/checkpoint.safetensors   the last checkpoint, with its state as JSON in the header
+    RUN/checkpoints/             earlier ones, if any are kept: step-001200.safetensors
     RUN/training.json     how long the training took, on which machine
 
 Every file is written beside its place and then moved there, so an interrupted write leaves the
@@ -11,31 +12,27 @@ earlier one. The folder can be moved; nothing in it is pickled.
 
 from __future__ import annotations
 
-import hashlib
-import json
 import os
-import shutil
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import torch
 from safetensors import SafetensorError
-from safetensors.torch import load as load_tensors
-from safetensors.torch import save_file
-from torch import Tensor
 
 from gsdmsr_cli import __version__
 from gsdmsr_cli.ground.errors import DataError, GsdmsrError, UsageError
-from gsdmsr_cli.ground.files import leftovers, read_json, replacing, write_json
+from gsdmsr_cli.ground.files import read_json, remove_leftovers, write_json
 from gsdmsr_cli.model.building import load_model
 from gsdmsr_cli.model.layer import Facts
 from gsdmsr_cli.model.model import Model
 from gsdmsr_cli.options import strict
 from gsdmsr_cli.options.preset import Preset
 from gsdmsr_cli.options.renamed import with_present_names
-from gsdmsr_cli.runs import earlier
+from gsdmsr_cli.runs import checkpoints, earlier, log
+from gsdmsr_cli.runs.checkpoints import LAST, WRONG, Checkpoint
 from gsdmsr_cli.scene.scene import Scene
 
 SCHEMA = 2
@@ -43,38 +40,10 @@ SCHEMA = 2
 tensor were called ``nodes``, and checkpoints counted events otherwise; 1 is converted when read."""
 
 _READ = 1, SCHEMA
-_WRONG = LookupError, TypeError, ValueError, AttributeError, OverflowError, RecursionError
-"""What values of other kinds than were written end in."""
-
-_ABOUT, _LOG, _CHECKPOINT = "run.json", "metrics.jsonl", "checkpoint.safetensors"
-_TRAINING = "training.json"
-
+_ABOUT, _LOG, _TRAINING = "run.json", "metrics.jsonl", "training.json"
 
 OUTPUTS = "eval", "render"
 """Folders in that of a run which the commands of these names write, if told no other."""
-
-
-@dataclass(frozen=True)
-class Checkpoint:
-    """A moment of the training.
-
-    Attributes:
-        step: steps made.
-        progress: in [0, 1].
-        elapsed: wall time of training so far [s].
-        tensors: the model's, and the optimiser's as far as the caller saved them.
-        state: everything else that a resumed training needs, plain JSON.
-        sha256: of the file that it was read from; empty where it was not.
-        file_bytes: size of that file.
-    """
-
-    step: int
-    progress: float
-    elapsed: float
-    tensors: dict[str, Tensor]
-    state: dict[str, Any]
-    sha256: str = ""
-    file_bytes: int = 0
 
 
 @dataclass(frozen=True)
@@ -109,7 +78,7 @@ class Run:
     @property
     def checkpoint_path(self) -> Path:
         """The last checkpoint."""
-        return self.root / _CHECKPOINT
+        return self.root / LAST
 
     @property
     def training_path(self) -> Path:
@@ -142,53 +111,25 @@ class Run:
                 "differ); give that folder with --data"
             )
 
-    def log(self, entry: Mapping[str, Any]) -> None:
-        """Append one line to the log."""
-        with self.log_path.open("a", encoding="utf-8") as file:
-            file.write(json.dumps(entry, allow_nan=False) + "\n")
+    def log(self, *entries: Mapping[str, Any]) -> None:
+        """Append lines to the log; see ``runs.log.append``."""
+        log.append(self.log_path, entries)
 
     def read_log(self) -> list[dict[str, Any]]:
-        """Return the entries of the log, without a last one that a killed training has cut short.
-
-        Raises:
-            DataError: the log cannot be read or is damaged.
-        """
-        if not self.log_path.is_file():
-            return []
-        try:
-            *lines, _ = self.log_path.read_text(encoding="utf-8").split("\n")
-            return [dict(json.loads(line)) for line in lines]
-        except (OSError, *_WRONG) as error:
-            raise DataError(f"{self.log_path}: cannot be read: {error}") from error
+        """Return the entries of the log; see ``runs.log.read``."""
+        return log.read(self.log_path)
 
     def rewind_log(self, step: int) -> None:
-        """Drop the lines of the log after ``step``, and one whose writing was interrupted."""
-        if not self.log_path.is_file():
-            return
-        lines = self.log_path.read_text(encoding="utf-8").splitlines(keepends=True)
-        kept = [line for line in lines if _is_up_to(step, line)]
-        with replacing(self.log_path) as beside:
-            beside.write_text("".join(kept), encoding="utf-8")
+        """Drop the lines of the log after ``step``; see ``runs.log.rewind``."""
+        log.rewind(self.log_path, step)
 
     def save(self, checkpoint: Checkpoint) -> None:
-        """Replace the last checkpoint.
+        """Replace the last checkpoint, and keep as many as the preset says.
 
         Raises:
-            DataError: it cannot be written; the earlier one is still there.
+            DataError: it cannot be written; the earlier ones are still there.
         """
-        state = {
-            "schema": SCHEMA,
-            "step": checkpoint.step,
-            "progress": checkpoint.progress,
-            "elapsed": checkpoint.elapsed,
-            "state": checkpoint.state,
-        }
-        tensors = {name: t.detach().contiguous() for name, t in checkpoint.tensors.items()}
-        with replacing(self.checkpoint_path) as beside:
-            try:
-                save_file(tensors, beside, metadata={"gsdmsr": json.dumps(state)})
-            except SafetensorError as error:
-                raise OSError(str(error)) from error
+        checkpoints.save(self.root, checkpoint, SCHEMA, self.preset.training.keep)
 
     def load(self) -> Checkpoint:
         """Read the last checkpoint; one of an earlier version is converted.
@@ -196,32 +137,49 @@ class Run:
         Raises:
             DataError: there is none, or it is damaged.
         """
-        if not self.checkpoint_path.is_file():
+        path = self.checkpoint_path
+        if not path.is_file() and not checkpoints.kept(self.root):
             raise DataError(
                 f"{self.root}: the run has no checkpoint yet; train it again with --overwrite"
             )
+        return self._load(path)
+
+    def load_whole(self) -> tuple[Checkpoint, str | None]:
+        """Read the last checkpoint that is whole, and return why it is not the very last one.
+
+        Raises:
+            DataError: there is none.
+        """
         try:
-            data = self.checkpoint_path.read_bytes()  # at once: a training may replace the file
-            state = json.loads(_metadata(data)["gsdmsr"])
-            tensors = load_tensors(data)
-            training = dict(state["state"])
-            if int(state["schema"]) < SCHEMA:
-                motion = str(self.preset.motion["name"])
-                tensors = earlier.present_tensors(tensors, motion)
-                training = earlier.present_state(training, motion)
-            return Checkpoint(
-                int(state["step"]),
-                float(state["progress"]),
-                float(state["elapsed"]),
-                tensors,
-                training,
-                hashlib.sha256(data).hexdigest(),
-                len(data),
+            return self.load(), None
+        except DataError as error:
+            reason = error
+        for path in checkpoints.kept(self.root):
+            with suppress(DataError):
+                checkpoint = self._load(path)
+                return checkpoint, f"{reason}; going on from step {checkpoint.step}, {path.name}"
+        raise reason
+
+    def _load(self, path: Path) -> Checkpoint:
+        """Read a checkpoint of the run."""
+        try:
+            checkpoint, schema = checkpoints.read(path)
+            if schema >= SCHEMA:
+                return checkpoint
+            motion = str(self.preset.motion["name"])
+            return replace(
+                checkpoint,
+                tensors=earlier.present_tensors(checkpoint.tensors, motion),
+                state=earlier.present_state(checkpoint.state, motion),
             )
-        except (SafetensorError, OSError, *_WRONG) as error:
-            raise DataError(
-                f"{self.checkpoint_path}: damaged checkpoint: {error}; train again with --overwrite"
-            ) from error
+        except (SafetensorError, OSError, *WRONG) as error:
+            known = path == self.checkpoint_path and checkpoints.kept(self.root)
+            remedy = (
+                f"train --resume goes on from {known[0].name}, which is kept"
+                if known
+                else "train again with --overwrite"
+            )
+            raise DataError(f"{path}: damaged checkpoint: {error}; {remedy}") from error
 
     def load_model(self) -> tuple[Model, Checkpoint]:
         """Read the model of the last checkpoint, for drawing.
@@ -244,9 +202,10 @@ class Run:
 def is_run(root: Path) -> bool:
     """Return whether ``root`` holds a run's description, not just any file of its name."""
     try:
-        return "gsdmsr" in read_json(root / _ABOUT)
+        about = read_json(root / _ABOUT)
     except DataError:
         return False
+    return "gsdmsr" in about and "preset" in about and isinstance(about.get("schema"), int)
 
 
 def refuse_used(root: Path, overwrite: bool) -> None:
@@ -299,8 +258,7 @@ def continue_run(run: Run, preset: Preset, scene: Scene) -> Run:
         DataError: the scene is not the run's, or the folder cannot be written.
     """
     run.check_scene(scene)
-    for left in leftovers(run.root):
-        left.unlink()  # a killed training was writing them
+    remove_leftovers(run.root)  # a killed training was writing them
     continued = replace(run, preset=preset, data=scene.root.resolve())
     continued.describe()
     return continued
@@ -333,7 +291,7 @@ def open_run(root: Path) -> Run:
             str(about["data"]["fingerprint"]),
             about.get("reason"),
         )
-    except (UsageError, *_WRONG) as error:
+    except (UsageError, *WRONG) as error:
         raise DataError(f"{path}: damaged: {error}") from error
 
 
@@ -358,19 +316,15 @@ def open_with_model(root: Path) -> tuple[Run, Model, Checkpoint]:
     return run, *found
 
 
-def _metadata(data: bytes) -> dict[str, str]:
-    """Return what the header of a safetensors file says beside its tensors."""
-    length = int.from_bytes(data[:8], "little")
-    return dict(json.loads(data[8 : 8 + length])["__metadata__"])
-
-
 def _clear(root: Path) -> None:
-    """Empty the folder of a run; the folder itself, which may be a link or a mount, stays."""
-    for entry in root.iterdir():
-        if entry.is_dir() and not entry.is_symlink():
-            shutil.rmtree(entry)
-        else:
-            entry.unlink()
+    """Remove what a training wrote into its folder, and nothing else.
+
+    Its description stays until it is replaced: a folder without one would be nobody's.
+    """
+    remove_leftovers(root)
+    checkpoints.remove(root)
+    for name in (_LOG, _TRAINING):
+        (root / name).unlink(missing_ok=True)
 
 
 def _require_place(root: Path) -> None:
@@ -379,10 +333,3 @@ def _require_place(root: Path) -> None:
     if not nearest.is_dir() or not os.access(nearest, os.W_OK):
         problem = "cannot be written" if nearest.is_dir() else "is a file"
         raise DataError(f"{root}: cannot be made, since {nearest} {problem}; choose another --out")
-
-
-def _is_up_to(step: int, line: str) -> bool:
-    try:
-        return bool(json.loads(line)["step"] <= step)
-    except (ValueError, LookupError, TypeError):
-        return False

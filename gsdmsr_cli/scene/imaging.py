@@ -66,7 +66,7 @@ def write_png(path: Path, image: NDArray[np.uint8]) -> None:
     swap = {3: cv2.COLOR_RGB2BGR, 4: cv2.COLOR_RGBA2BGRA}.get(image.shape[2])
     ordered = image if swap is None else cv2.cvtColor(image, swap)
     encoded = cv2.imencode(".png", ordered, _PNG_SETTINGS)[1]
-    with replacing(path) as temporary:
+    with replacing(path, durable=False) as temporary:
         temporary.write_bytes(encoded.tobytes())
 
 
@@ -86,7 +86,7 @@ def write_exr(path: Path, image: NDArray[np.float32], channels: tuple[str, ...])
     spec = OpenImageIO.ImageSpec(width, height, count, OpenImageIO.FLOAT)
     spec.channelnames = channels
     spec["compression"] = "zips"
-    with replacing(path) as temporary:
+    with replacing(path, durable=False) as temporary:
         temporary.touch()  # says why a file cannot be opened, which OpenImageIO does not
         out = OpenImageIO.ImageOutput.create(str(temporary))
         if out is None:

@@ -19,6 +19,7 @@ from gsdmsr_cli.evaluation.metrics import PSNR_CAP, psnr, quantize
 from gsdmsr_cli.evaluation.protocol import ViewRenderer
 from gsdmsr_cli.runs.run import Run
 from gsdmsr_cli.scene.scene import Scene, View
+from gsdmsr_cli.training.keeping import Keeper
 from gsdmsr_cli.training.trainer import Trainer
 
 REPORT_EVERY = 2.0
@@ -82,55 +83,69 @@ class Report:
         }
 
 
-def train(trainer: Trainer, run: Run, on_report: Callable[[Report], None]) -> bool:
+def train(
+    trainer: Trainer,
+    run: Run,
+    on_report: Callable[[Report], None],
+    on_warning: Callable[[str], None] = lambda text: None,
+) -> bool:
     """Train to the end of the clock; return False if Ctrl-C ended it earlier.
 
     Every report goes to the run's log and to ``on_report``. Checkpoints are saved at the preset's
-    interval and at either end. Reports and checkpoints count as time of training.
+    interval and at either end, whatever ends the training. Reports and checkpoints count as time of
+    training. What cannot be written for a while is told to ``on_warning``.
 
     Raises:
         GsdmsrError: the training has diverged; the last checkpoint is kept.
-        DataError: a picture cannot be read, or a checkpoint not be written.
+        DataError: a picture cannot be read, or the last checkpoint not be written.
     """
+    keeper = Keeper(trainer, run, on_warning)
+    with _ctrl_c() as wanted:
+        try:
+            _make_steps(trainer, keeper, on_report, wanted)
+        except KeyboardInterrupt:  # the second Ctrl-C, which does not wait
+            raise
+        except BaseException:
+            keeper.rescue()
+            raise
+        keeper.finish()
+    return not wanted.is_set()
+
+
+def _make_steps(
+    trainer: Trainer,
+    keeper: Keeper,
+    on_report: Callable[[Report], None],
+    wanted: threading.Event,
+) -> None:
+    """Make steps until the clock has run out or the end is wanted."""
+
+    def tell() -> None:
+        report = interval.report()
+        keeper.log(report.entry())
+        on_report(report)
+
     interval = _Interval(trainer, validation_view(trainer.scene))
     save_every = 60 * trainer.preset.training.checkpoint_minutes
-    with _ctrl_c() as wanted:
-        trainer.clock.start()
-        interval.begin()
-        saved = time.perf_counter()
-        while trainer.clock.progress < 1 and not wanted.is_set():
-            interval.count(trainer.step().loss)
-            if interval.is_due():
-                _log(interval.report(), run, on_report)
-            if time.perf_counter() - saved >= save_every:
-                with trainer.stopwatch.of("save"):
-                    _save(trainer, run)
-                saved = time.perf_counter()
-        if interval.losses:
-            _log(interval.report(), run, on_report)
-        _save(trainer, run)
-    return not wanted.is_set()
+    trainer.clock.start()
+    interval.begin()
+    saved = time.perf_counter()
+    while trainer.clock.progress < 1 and not wanted.is_set():
+        interval.count(trainer.step().loss)
+        if interval.is_due():
+            tell()
+        if time.perf_counter() - saved >= save_every:
+            with trainer.stopwatch.of("save"):
+                keeper.save()
+            saved = time.perf_counter()
+    if interval.losses:
+        tell()
 
 
 def validation_view(scene: Scene) -> View:
     """Return the view whose PSNR is reported: the middle one of val, or of train without a val."""
     views = [view for view in scene.views if view.split == "val"] or scene.split("train")
     return views[len(views) // 2]
-
-
-def _save(trainer: Trainer, run: Run) -> None:
-    """Save a checkpoint, of splats with finite values alone.
-
-    Raises:
-        GsdmsrError: the training has diverged; the earlier checkpoint stays.
-    """
-    trainer.population.drop_not_finite()
-    run.save(trainer.checkpoint())
-
-
-def _log(report: Report, run: Run, on_report: Callable[[Report], None]) -> None:
-    run.log(report.entry())
-    on_report(report)
 
 
 @dataclass

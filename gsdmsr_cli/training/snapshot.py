@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from gsdmsr_cli.model.model import MOVING, Model
-from gsdmsr_cli.runs.run import Checkpoint
+from gsdmsr_cli.runs.checkpoints import Checkpoint
 from gsdmsr_cli.training.averaging import Average
 from gsdmsr_cli.training.gradients.tiles import TileSampler
 from gsdmsr_cli.training.optimizer import Adam

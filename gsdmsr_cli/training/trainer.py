@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import torch
@@ -15,7 +16,7 @@ from gsdmsr_cli.model.model import MOVING, Model
 from gsdmsr_cli.ops.finite import all_finite, not_finite
 from gsdmsr_cli.options.preset import BACKGROUNDS, Preset
 from gsdmsr_cli.raster import Engine
-from gsdmsr_cli.runs.run import Checkpoint
+from gsdmsr_cli.runs.checkpoints import Checkpoint
 from gsdmsr_cli.scene.camera import Camera
 from gsdmsr_cli.scene.pictures import Pictures
 from gsdmsr_cli.scene.scene import Scene
@@ -64,6 +65,7 @@ class Trainer:
         events: what changes the splats after a step, by name, in their order.
         stopwatch: adds up what the time goes into.
         queue: rows of the views that come next, the last one first.
+        changing: whether a step is changing the model, or an error has ended such a change.
     """
 
     def __init__(
@@ -97,6 +99,7 @@ class Trainer:
         self.stopwatch = Stopwatch()
         self.queue: list[int] = []
         self._times = scene.train_times
+        self.changing = False
         self._skipped = 0
 
     def populate(self, model: Model) -> Population:
@@ -126,28 +129,57 @@ class Trainer:
     def step(self) -> Step:
         """Choose views, take their gradients, let Adam step, let events change the splats."""
         progress = self.clock.progress
-        self._enter_phase(progress)
-        orders = self._choose_views(progress)
+        with self._change():
+            self._enter_phase(progress)
         gated = self._is_gated(progress)
         mask = self.saliency.gradient_mask(self.clock.step) if gated else None
         phase = Phase(progress, self.population.moving, mask)
-        with self.stopwatch.of("gradients"):
-            views, penalty = self.workers.gradients(
-                self.model, orders, phase, lambda: self._penalty(orders[0], progress)
-            )
+        with self._choices_that_count():
+            orders = self._choose_views(progress)
+            with self.stopwatch.of("gradients"):
+                views, penalty = self.workers.gradients(
+                    self.model, orders, phase, lambda: self._penalty(orders[0], progress)
+                )
         loss = _set_gradients(self.model, views, penalty)
         self.clock.step += 1
         loss = self._checked(loss)
         if loss.is_cpu and not self.count([loss.item()]):
             return self._skip(loss)
-        self._record(orders, views, progress, loss)
-        with self.stopwatch.of("optimizer"):
-            self._update(progress, loss, views if gated else None)
-        with self.stopwatch.of("population"):
-            self._apply_events(Tick(self.clock.step, progress))
-        if self.clock.step % averaging.EVERY == 0:
-            self._average(progress)
+        with self._change():
+            self._record(orders, views, progress, loss)
+            with self.stopwatch.of("optimizer"):
+                self._update(progress, loss, views if gated else None)
+            with self.stopwatch.of("population"):
+                self._apply_events(Tick(self.clock.step, progress))
+            if self.clock.step % averaging.EVERY == 0:
+                self._average(progress)
         return Step(loss)
+
+    @property
+    def is_sound(self) -> bool:
+        """Whether a checkpoint can be taken: no step was cut short, and the last loss is finite."""
+        return not (self.changing or self._skipped)
+
+    @contextmanager
+    def _change(self) -> Iterator[None]:
+        """Know that the model is not what whole steps have made of it if the block fails."""
+        self.changing = True
+        yield
+        self.changing = False
+
+    @contextmanager
+    def _choices_that_count(self) -> Iterator[None]:
+        """Take random choices back if the block fails, such as for a picture that is damaged.
+
+        So a resumed training makes the same choices as one that has not failed.
+        """
+        queue, state = list(self.queue), self.generator.get_state()
+        try:
+            yield
+        except BaseException:
+            self.queue = queue
+            self.generator.set_state(state)
+            raise
 
     def _enter_phase(self, progress: float) -> None:
         """Drop splats that are not finite, and start the motion after the static phase."""

@@ -13,7 +13,7 @@ import torch
 
 from gsdmsr_cli.benchmark.kills import same, survive
 from gsdmsr_cli.ground.errors import DataError
-from gsdmsr_cli.runs.run import Checkpoint
+from gsdmsr_cli.runs.checkpoints import Checkpoint
 
 
 def checkpoint() -> Checkpoint:

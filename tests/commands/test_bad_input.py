@@ -25,7 +25,7 @@ from gsdmsr_cli.ground import files, locks
 from gsdmsr_cli.ground.errors import DataError, UsageError
 from gsdmsr_cli.options.preset import load_preset
 from gsdmsr_cli.raster import best_engine
-from gsdmsr_cli.runs import run as runs
+from gsdmsr_cli.runs import checkpoints
 from gsdmsr_cli.runs.run import Run, continue_run, create_run, open_run, refuse_used
 from gsdmsr_cli.scene import imaging
 from gsdmsr_cli.scene.pictures import Pictures
@@ -187,12 +187,10 @@ def test_a_place_below_a_file_is_refused_at_once(tmp_path: Path) -> None:
 
 def test_overwriting_keeps_the_folder_itself(run: Run, tiny_scene: Path) -> None:
     """It may be a mounted disk, which cannot be removed, or somebody's link."""
-    (run.root / "eval").mkdir()
-    (run.root / "eval" / "metrics.json").touch()
     (run.root / "link").symlink_to(tiny_scene, target_is_directory=True)
     before = run.root.stat().st_ino
     create_run(run.root, "again", run.preset, run.facts, read_scene(tiny_scene), overwrite=True)
-    assert [path.name for path in run.root.iterdir()] == ["run.json"]
+    assert {path.name for path in run.root.iterdir()} == {"run.json", "link"}
     assert run.root.stat().st_ino == before and (tiny_scene / "train").is_dir()
 
 
@@ -250,7 +248,7 @@ def test_a_full_disk_is_told_before_the_training_not_after_it(
     def full(*_: object, **__: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(runs, "save_file", full)
+    monkeypatch.setattr(checkpoints, "save_file", full)
     monkeypatch.setattr(train_command, "train", lambda *_: pytest.fail("it trains"))
     options = [part for option in FEW for part in ("--set", option)]
     assert gsdmsr("train", "--data", tiny_scene, "--out", tmp_path / "run", *options) == 3
@@ -273,10 +271,14 @@ def test_a_folder_without_leave_to_write_is_told(tmp_path: Path, monkeypatch: An
 
 
 def test_what_a_killed_training_was_writing_is_cleared_away(run: Run, tiny_scene: Path) -> None:
-    for name in (".tmpAbc123", ".checkpoint.4f.part.safetensors", ".run.07.part.json"):
+    ours, others = f".gsdmsr-{'4f' * 16}.part", {".tmpAbc123", ".mine.part.json"}
+    for name in (f"{ours}.json", *others):
         (run.root / name).touch()
+    (run.root / ours).mkdir()
+    (run.root / ours / "checkpoint.safetensors").touch()
     continue_run(run, run.preset, read_scene(tiny_scene))
-    assert {path.name for path in run.root.iterdir()} == {"run.json", "checkpoint.safetensors"}
+    files = {path.name for path in run.root.iterdir()}
+    assert files == {"run.json", "checkpoint.safetensors", *others}
 
 
 @pytest.mark.parametrize(

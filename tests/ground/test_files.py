@@ -4,12 +4,21 @@ from __future__ import annotations
 
 import json
 import math
+import os
+import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from gsdmsr_cli.ground.errors import DataError
-from gsdmsr_cli.ground.files import read_json, replacing, write_json
+from gsdmsr_cli.ground.files import (
+    read_json,
+    remove_leftovers,
+    replacing,
+    write_json,
+    written_apart,
+)
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
@@ -57,3 +66,57 @@ def test_json_that_is_nested_too_deeply_is_refused(tmp_path: Path) -> None:
     path.write_text('{"a":' * 100_000)
     with pytest.raises(DataError, match="nested too deeply"):
         read_json(path)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="folders cannot be flushed there")
+@pytest.mark.parametrize(("durable", "flushed"), [(True, ["file", "folder"]), (False, [])])
+def test_a_file_and_then_its_name_are_brought_to_the_disk(
+    tmp_path: Path, monkeypatch: Any, durable: bool, flushed: list[str]
+) -> None:
+    path, done, fsync = tmp_path / "a.txt", list[str](), os.fsync
+
+    def watched(descriptor: int) -> None:
+        folder = os.path.samestat(os.fstat(descriptor), tmp_path.stat())
+        assert path.exists() == folder  # the file before it gets its name, the folder after that
+        done.append("folder" if folder else "file")
+        fsync(descriptor)
+
+    monkeypatch.setattr(os, "fsync", watched)
+    with replacing(path, durable) as beside:
+        beside.write_text("new")
+    assert done == flushed and path.read_text() == "new"
+
+
+def test_a_file_that_cannot_be_brought_to_the_disk_is_not_written(
+    tmp_path: Path, monkeypatch: Any
+) -> None:
+    def fail(_: int) -> None:
+        raise OSError(5, "Input/output error")
+
+    (tmp_path / "a.txt").write_text("old")
+    monkeypatch.setattr(os, "fsync", fail)
+    with pytest.raises(DataError, match="Input/output error"), replacing(tmp_path / "a.txt") as new:
+        new.write_text("new")
+    assert (tmp_path / "a.txt").read_text() == "old"
+    assert [path.name for path in tmp_path.iterdir()] == ["a.txt"]
+
+
+def test_only_what_we_have_left_unfinished_is_removed(tmp_path: Path) -> None:
+    names = (
+        ".tmpAbc123",
+        ".a.part",
+        ".gsdmsr-12.part",
+        "a.part.txt",
+        ".gsdmsr-" + 32 * "g" + ".part",
+    )
+    for name in names:
+        (tmp_path / name).touch()
+    left, begun = list[Path](), list[Any]()
+    for name in ("a.txt", "a" * 200 + ".txt"):
+        begun += replacing(tmp_path / name), written_apart(tmp_path / name)
+        left += begun[-2].__enter__(), begun[-1].__enter__().parent  # as a kill leaves them
+        left[-2].write_text("half")
+    remove_leftovers(tmp_path, "a.txt")
+    assert [path.exists() for path in left] == [False, False, True, True]
+    remove_leftovers(tmp_path)
+    assert {path.name for path in tmp_path.iterdir()} == set(names)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -21,9 +22,9 @@ from gsdmsr_cli.ground.errors import DataError
 from gsdmsr_cli.model.building import start_model
 from gsdmsr_cli.model.layer import Facts
 from gsdmsr_cli.options.preset import Preset, load_preset
-from gsdmsr_cli.runs import earlier
-from gsdmsr_cli.runs import run as runs
-from gsdmsr_cli.runs.run import Checkpoint, Run, continue_run, create_run, open_run, refuse_used
+from gsdmsr_cli.runs import checkpoints, earlier
+from gsdmsr_cli.runs.checkpoints import Checkpoint
+from gsdmsr_cli.runs.run import Run, continue_run, create_run, open_run, refuse_used
 from gsdmsr_cli.scene.scene import Scene
 
 FACTS = Facts(bound=1.3, box=((-1.0, -1.1, -1.2), (1.3, 1.2, 1.1)), frames=12)
@@ -116,7 +117,7 @@ def test_a_checkpoint_that_cannot_be_written_leaves_the_one_before(
     run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     run.save(checkpoint_of(7))
-    monkeypatch.setattr(runs, "save_file", fails_halfway)
+    monkeypatch.setattr(checkpoints, "save_file", fails_halfway)
     with pytest.raises(DataError, match=r"checkpoint\.safetensors: cannot be written: .*No space"):
         run.save(checkpoint_of(8))
     assert run.load().step == 7
@@ -134,12 +135,106 @@ def test_a_kill_while_a_checkpoint_is_written_leaves_the_one_before(
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-        patch.setattr(runs, "save_file", is_killed)
+        patch.setattr(checkpoints, "save_file", is_killed)
         run.save(checkpoint_of(8))
     assert open_run(run.root).load().step == 7
     run.save(checkpoint_of(9))
     assert open_run(run.root).load().step == 9
     assert files_of(run) == {"run.json", "checkpoint.safetensors"}
+
+
+def keeping(run: Run, count: int) -> Run:
+    return replace(run, preset=load_preset("static", None, [f"training.keep={count}"]))
+
+
+def test_as_many_checkpoints_are_kept_as_is_wanted(run: Run) -> None:
+    run, others = keeping(run, 3), run.root / "checkpoints" / "best.safetensors"
+    for step in range(1, 6):
+        run.save(checkpoint_of(step))
+    earlier = run.root / "checkpoints"
+    names = "step-000003.safetensors", "step-000004.safetensors"
+    assert sorted(path.name for path in earlier.iterdir()) == list(names)
+    assert run.load().step == 5
+    for step, name in zip((3, 4), names, strict=True):
+        checkpoint, _ = checkpoints.read(earlier / name)
+        assert checkpoint.step == step
+        assert torch.equal(
+            checkpoint.tensors["generator"], checkpoint_of(step).tensors["generator"]
+        )
+    others.touch()
+    keeping(run, 2).save(checkpoint_of(6))
+    assert {path.name for path in earlier.iterdir()} == {"step-000005.safetensors", others.name}
+    others.unlink()
+    keeping(run, 1).save(checkpoint_of(7))
+    assert files_of(run) == {"run.json", "checkpoint.safetensors"}
+
+
+def test_a_drive_without_hard_links_keeps_copies(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object) -> None:
+        raise PermissionError(1, "Operation not permitted")
+
+    monkeypatch.setattr(checkpoints.os, "link", refuse)
+    for step in (7, 8):
+        keeping(run, 2).save(checkpoint_of(step))
+    checkpoint, _ = checkpoints.read(run.root / "checkpoints" / "step-000007.safetensors")
+    assert checkpoint.step == 7
+
+
+@pytest.mark.parametrize("damage", [lambda p: p.unlink(), lambda p: p.write_bytes(b"half")])
+def test_a_damaged_checkpoint_falls_back_to_the_one_before(run: Run, damage: Any) -> None:
+    run = keeping(run, 2)
+    for step in (7, 8):
+        run.save(checkpoint_of(step))
+    assert run.load_whole()[1] is None
+    damage(run.checkpoint_path)
+    with pytest.raises(DataError, match=r"train --resume goes on from step-000007\.safetensors"):
+        run.load()
+    checkpoint, told = run.load_whole()
+    assert checkpoint.step == 7
+    assert told is not None and "damaged checkpoint" in told and "going on from step 7" in told
+    run.save(checkpoint_of(9))  # what is damaged is not kept in place of what is whole
+    assert run.load().step == 9
+    assert [path.name for path in checkpoints.kept(run.root)] == ["step-000007.safetensors"]
+
+
+def test_the_checkpoint_before_stays_until_the_new_one_can_be_read(
+    run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As on a drive that takes all bytes and keeps half of them."""
+    run.save(checkpoint_of(7))
+
+    def lies(tensors: Any, path: Path, metadata: Any) -> None:
+        save_file(tensors, path, metadata)
+        Path(path).write_bytes(Path(path).read_bytes()[:-9])
+
+    monkeypatch.setattr(checkpoints, "save_file", lies)
+    with pytest.raises(DataError, match=r"checkpoint\.safetensors: cannot be written"):
+        run.save(checkpoint_of(8))
+    assert run.load().step == 7
+    assert files_of(run) == {"run.json", "checkpoint.safetensors"}
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows has no umask")
+@pytest.mark.parametrize("umask", [0o022, 0o027, 0o077])
+def test_files_have_the_rights_that_the_umask_gives(run: Run, umask: int) -> None:
+    before = os.umask(umask)
+    try:
+        run.describe()
+        run.log({"step": 1})
+        for step in (7, 8):
+            keeping(run, 2).save(checkpoint_of(step))
+    finally:
+        os.umask(before)
+    for path in run.root.rglob("*.*"):
+        assert path.stat().st_mode & 0o777 == 0o666 & ~umask, path
+
+
+def test_a_log_goes_on_after_a_line_that_was_cut_short(run: Run) -> None:
+    run.log({"step": 3})
+    with run.log_path.open("a") as file:
+        file.write('{"step": 4, "lo')
+    run.log({"step": 4}, {"step": 5})
+    assert run.read_log() == [{"step": 3}, {"step": 4}, {"step": 5}]
 
 
 def test_the_model_of_a_checkpoint_is_for_drawing(run: Run) -> None:
@@ -166,7 +261,7 @@ def test_a_cut_checkpoint_is_told(run: Run, length: int) -> None:
     "header", [None, {}, {"gsdmsr": "{"}, {"gsdmsr": "[]"}, {"gsdmsr": '{"step": 1}'}]
 )
 def test_a_checkpoint_of_someone_else_is_told(run: Run, header: dict[str, str] | None) -> None:
-    runs.save_file({"weight": torch.ones(2)}, run.checkpoint_path, metadata=header)
+    checkpoints.save_file({"weight": torch.ones(2)}, run.checkpoint_path, metadata=header)
     with pytest.raises(DataError, match="damaged checkpoint"):
         run.load()
 
@@ -270,6 +365,26 @@ def test_a_run_is_replaced_only_if_asked_for(run: Run, scene: Scene) -> None:
     assert run.load().step == 7
     create_run(run.root, "dnerf", Preset(), FACTS, scene, overwrite=True)
     assert files_of(run) == {"run.json"}
+
+
+def test_replacing_a_run_removes_nothing_that_train_has_not_written(run: Run, scene: Scene) -> None:
+    run.save(checkpoint_of())
+    run.log({"step": 1})
+    run.training_path.touch()
+    others = {"notes.md", ".tmpAbc123", ".mine.part.txt", "checkpoints/best.safetensors", "eval/a"}
+    for name in others:
+        (run.root / name).parent.mkdir(exist_ok=True)
+        (run.root / name).write_text("of somebody")
+    create_run(run.root, "dnerf", Preset(), FACTS, scene, overwrite=True)
+    files = {str(path.relative_to(run.root)) for path in run.root.rglob("*") if path.is_file()}
+    assert files == {"run.json", *others}
+
+
+def test_a_description_of_another_program_is_no_run(tmp_path: Path, scene: Scene) -> None:
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "run.json").write_text('{"gsdmsr": "is fine"}')
+    with pytest.raises(DataError, match="is not a run folder"):
+        create_run(tmp_path / "run", "dnerf", Preset(), FACTS, scene, overwrite=True)
 
 
 @pytest.mark.parametrize("overwrite", [False, True])

@@ -6,6 +6,7 @@ import json
 import math
 import signal
 import threading
+from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -25,8 +26,10 @@ from training_checks import (
 from gsdmsr_cli.drawing.splatting import draw
 from gsdmsr_cli.evaluation.metrics import psnr, quantize
 from gsdmsr_cli.ground.errors import DataError, GsdmsrError
-from gsdmsr_cli.runs.run import Checkpoint, Run
-from gsdmsr_cli.training import loop
+from gsdmsr_cli.runs import checkpoints, log
+from gsdmsr_cli.runs.checkpoints import Checkpoint
+from gsdmsr_cli.runs.run import Run
+from gsdmsr_cli.training import keeping, loop
 from gsdmsr_cli.training.loop import Report, train, validation_view
 from gsdmsr_cli.training.trainer import Step, Trainer
 
@@ -253,6 +256,115 @@ def test_an_error_leaves_the_last_checkpoint(
         train(trainer, run, lambda report: None)
     assert run.load().step == 4
     assert signal.getsignal(signal.SIGINT) is handler
+
+
+def frequent(tiny_scene: Path, tmp_path: Path) -> tuple[Trainer, Run]:
+    """A training that saves after every step, and its run folder with a first checkpoint."""
+    trainer = trainer_of(tiny_scene, preset_of("training.checkpoint_minutes=1e-9", motion="static"))
+    run = run_of(trainer, tmp_path / "run")
+    run.save(trainer.checkpoint())
+    return trainer, run
+
+
+def failing(monkeypatch: Any, target: Any, name: str, fails: Callable[[int], bool]) -> list[int]:
+    """Let the calls of a function of which ``fails`` is true end with a full disk; count them."""
+    calls, function = [0], getattr(target, name)
+
+    def call(*arguments: Any, **named: Any) -> Any:
+        calls[0] += 1
+        if fails(calls[0]):
+            raise OSError(28, "No space left on device")
+        return function(*arguments, **named)
+
+    monkeypatch.setattr(target, name, call)
+    return calls
+
+
+def test_a_disk_that_is_full_for_a_while_does_not_end_a_training(
+    tiny_scene: Path, tmp_path: Path, monkeypatch: Any
+) -> None:
+    trainer, run = frequent(tiny_scene, tmp_path)
+    at_most: list[int] = []
+    failing(monkeypatch, checkpoints, "save_file", lambda n: 5 <= n < 9 or n == 20)
+    warnings: list[str] = []
+    assert train(trainer, run, lambda r: at_most.append(run.load().step), warnings.append)
+    # a report comes before the checkpoint of its step
+    assert at_most == [*range(5), *[4] * 4, *range(9, 20), 19, *range(21, 40)]
+    assert run.load().step == STEPS
+    assert len(warnings) == 2  # once for each time in a row
+    assert all("No space left on device" in text and "tries again" in text for text in warnings)
+
+
+def test_lines_of_the_log_wait_until_they_can_be_written(
+    trainer: Trainer, run: Run, monkeypatch: Any
+) -> None:
+    failing(monkeypatch, log.os, "fdopen", lambda n: 3 <= n < 8)
+    warnings: list[str] = []
+    assert train(trainer, run, lambda report: None, warnings.append)
+    assert [entry["step"] for entry in log_of(run)] == list(range(1, STEPS + 1))
+    assert len(warnings) == 1 and "metrics.jsonl: cannot be written" in warnings[0]
+
+
+def test_the_last_checkpoint_is_tried_again(trainer: Trainer, run: Run, monkeypatch: Any) -> None:
+    monkeypatch.setattr(keeping, "PAUSES", (0.0, 0.0, 0.0))
+    calls = failing(monkeypatch, checkpoints, "save_file", lambda n: n < 4)
+    warnings: list[str] = []
+    assert train(trainer, run, lambda report: None, warnings.append)
+    assert calls == [4] and run.load().step == STEPS and len(warnings) == 1
+
+
+def test_a_full_disk_at_the_end_leaves_the_checkpoint_before_and_says_so(
+    tiny_scene: Path, tmp_path: Path, monkeypatch: Any
+) -> None:
+    trainer, run = frequent(tiny_scene, tmp_path)
+    monkeypatch.setattr(keeping, "PAUSES", (0.0, 0.0, 0.0))
+    failing(monkeypatch, checkpoints, "save_file", lambda n: n > 7)
+    with pytest.raises(DataError, match=f"has come to step {STEPS}; the checkpoint before stays"):
+        train(trainer, run, lambda report: None)
+    assert run.load().step == 7
+
+
+@pytest.mark.parametrize("error", [ZeroDivisionError(), SystemExit(1), MemoryError()])
+def test_whatever_ends_the_loop_the_last_state_is_saved(
+    trainer: Trainer, run: Run, error: BaseException
+) -> None:
+    def fail(report: Report) -> None:
+        if report.step == 5:
+            raise error
+
+    warnings: list[str] = []
+    with pytest.raises(type(error)):
+        train(trainer, run, fail, warnings.append)
+    assert run.load().step == 5
+    assert warnings == ["an error ends the training; --resume goes on from step 5"]
+
+
+def test_what_a_step_has_half_changed_is_not_saved(
+    tiny_scene: Path, tmp_path: Path, monkeypatch: Any
+) -> None:
+    trainer, run = frequent(tiny_scene, tmp_path)
+    failing(monkeypatch, Trainer, "_apply_events", lambda n: n == 6)
+    with pytest.raises(OSError, match="No space"):
+        train(trainer, run, lambda report: None)
+    assert run.load().step == 5
+
+
+def test_a_training_goes_on_from_an_error_as_if_there_had_been_none(
+    tiny_scene: Path, tmp_path: Path, monkeypatch: Any
+) -> None:
+    preset = preset_of("training.views_per_step=2")
+    undisturbed = trainer_of(tiny_scene, preset)
+    train(undisturbed, run_of(undisturbed, tmp_path / "a"), lambda report: None)
+    trainer = trainer_of(tiny_scene, preset)
+    run = run_of(trainer, tmp_path / "b")
+    with monkeypatch.context() as patch, pytest.raises(OSError, match="No space"):
+        failing(patch, type(trainer.workers), "gradients", lambda n: n == 23)
+        train(trainer, run, lambda report: None)
+    assert run.load().step == 22
+    resumed = trainer_of(tiny_scene, preset)
+    resumed.restore(run.load())
+    train(resumed, run, lambda report: None)
+    assert_same_tensors(copies(resumed.model.tensors()), copies(undisturbed.model.tensors()))
 
 
 def test_time_left_follows_from_the_pace() -> None:
