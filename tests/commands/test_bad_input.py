@@ -250,7 +250,7 @@ def test_a_full_disk_is_told_before_the_training_not_after_it(
 
     monkeypatch.setattr(checkpoints, "save_file", full)
     monkeypatch.setattr(train_command, "train", lambda *_: pytest.fail("it trains"))
-    options = [part for option in FEW for part in ("--set", option)]
+    options = ["--preset=dnerf", *(f"--set={option}" for option in FEW)]
     assert gsdmsr("train", "--data", tiny_scene, "--out", tmp_path / "run", *options) == 3
     assert "checkpoint.safetensors: cannot be written" in one_line(capsys)
 
