@@ -38,7 +38,8 @@ from gsdmsr_cli.model.building import start_model
 from gsdmsr_cli.model.layer import Facts
 from gsdmsr_cli.options.preset import load_preset
 from gsdmsr_cli.paths import _keyframes
-from gsdmsr_cli.runs.run import Checkpoint, create_run, open_run
+from gsdmsr_cli.runs.checkpoints import Checkpoint
+from gsdmsr_cli.runs.run import create_run, open_run
 from gsdmsr_cli.scene import imaging
 from gsdmsr_cli.scene.native import cv2
 from gsdmsr_cli.scene.picture_files import IN_CAPTURES

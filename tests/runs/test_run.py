@@ -277,7 +277,7 @@ def test_a_checkpoint_of_someone_else_is_told(run: Run, header: dict[str, str] |
 def test_a_checkpoint_with_values_of_other_kinds_is_told(run: Run, change: dict[str, Any]) -> None:
     state = {"schema": 2, "step": 1, "progress": 0.1, "elapsed": 1, "state": {}} | change
     header = {"gsdmsr": json.dumps(state)}
-    runs.save_file({"weight": torch.ones(2)}, run.checkpoint_path, metadata=header)
+    checkpoints.save_file({"weight": torch.ones(2)}, run.checkpoint_path, metadata=header)
     with pytest.raises(DataError, match="damaged checkpoint"):
         run.load()
 
