@@ -32,6 +32,12 @@ def test_the_capture_holds_what_is_asked_for(capture: Path) -> None:
     assert len({view.image_path.read_bytes() for view in scene.views}) == 9
 
 
+def test_every_picture_is_told_of(tmp_path: Path) -> None:
+    told: list[tuple[int, int]] = []
+    write_capture(tmp_path, 3, 5, lambda done, total: told.append((done, total)))
+    assert told == [(1, 3), (2, 3), (3, 3)]
+
+
 def test_every_phase_is_measured(capture: Path) -> None:
     phases = list(measure(capture))
     assert len(phases) == 3

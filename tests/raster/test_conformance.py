@@ -24,6 +24,7 @@ from raster_scenes import (
 )
 from torch import Tensor
 
+from gsdmsr_cli.gaussians.moment import Moment
 from gsdmsr_cli.ground.splatting_constants import ALPHA_MAX, TRANSMITTANCE_STOP, tile_grid
 from gsdmsr_cli.raster import Comparing, Engine, engine_names, load_engine, reference
 from gsdmsr_cli.training.gradients.compare import compare_frame
@@ -182,6 +183,15 @@ def test_axes_that_overflow_spoil_neither_picture_nor_gradients(placed: Placed) 
     for name, gradient in found.gradients.items():
         assert gradient.isfinite().all(), name
     assert (found.frame.radii > 0).sum() > 10
+
+
+def test_what_was_drawn_carries_gradients_and_radii_do_not(placed: Placed) -> None:
+    of = case("17x33, 1 features").splats.map(
+        lambda t: t.detach().float().to(placed[1]).requires_grad_()
+    )
+    frame = placed[0].rasterize(Moment(of), case("17x33, 1 features").camera, torch.ones(3))
+    assert frame.rgb.requires_grad and frame.means2d.requires_grad
+    assert not frame.radii.requires_grad
 
 
 def test_features_are_not_compared_in_one_go(placed: Placed) -> None:

@@ -101,6 +101,22 @@ def test_text_stays_text_and_reasons_and_verdicts_are_told() -> None:
     assert "3.88 dB more" in text  # train less test
 
 
+@pytest.mark.parametrize(
+    ("there", "shown"),
+    [("alex vgg squeeze", "alex"), ("squeeze vgg", "vgg"), ("squeeze", "squeeze")],
+)
+def test_one_lpips_is_shown_large(there: str, shown: str) -> None:
+    """The first that has a value; papers give those of alex and vgg."""
+    values = {
+        f"lpips_{net}": {"value": 0.1, "reason": None, "searched": []} for net in there.split()
+    }
+    document = small_report()
+    aggregate = {k: v for k, v in document["aggregate"].items() if "lpips" not in k} | values
+    text = made(aggregate=aggregate)
+    tiles = [net for net in ("alex", "vgg", "squeeze") if f"LPIPS, {net}" in text]
+    assert tiles == [shown]
+
+
 def test_charts_have_titles_and_axes() -> None:
     charts = re.findall(r"<svg.*?</svg>", made(), re.DOTALL)
     assert len(charts) == 3
