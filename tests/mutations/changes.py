@@ -7,7 +7,20 @@ from pathlib import Path
 
 import yaml
 
+ROOT = Path(__file__).parents[2]
+
 LIST = Path(__file__).parent / "listed.yaml"
+
+KERNELS = (
+    "ops/*/cpu.py", "ops/*/cpu/*.py", "backends/cpu/*.py", "ground/splatting_constants.py",
+    "ground/ssim.py",
+)  # fmt: skip
+"""What kernels of the CPU are compiled from, all of them anew after each change."""
+
+
+def is_kernel(file: str) -> bool:
+    """Return whether kernels are compiled from a file of the package."""
+    return any(Path(file).match(pattern) for pattern in KERNELS)
 
 
 @dataclass(frozen=True)

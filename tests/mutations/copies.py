@@ -16,14 +16,12 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from changes import Change
-
-ROOT = Path(__file__).parents[2]
+from changes import ROOT, Change, is_kernel
 
 MEMORY = 8 << 30
 """Most memory that a run of tests may have [bytes]: a wrong change may ask for any amount."""
 
-KERNELS = "gsdmsr_cli/backends/cpu/__pycache__"
+COMPILED = "gsdmsr_cli/backends/cpu/__pycache__"
 """Where compiled kernels lie, in a folder for each state of their sources."""
 
 OPTIONS = "-x", "-q", "-n", "0", "-p", "no:cacheprovider", "--no-header", "--tb=no", "-rfE"
@@ -66,7 +64,7 @@ class Copy:
 
     def test(self, tests: Sequence[str], limit: float) -> Outcome:
         """Run those tests that there are, up to the first that fails."""
-        there = [test for test in tests if (self.folder / test).exists()]
+        there = [t for t in tests if (self.folder / t.partition("::")[0]).exists()]
         if not there:
             return Outcome("no tests", "", 0.0)
         scratch = self.folder / "scratch"
@@ -105,17 +103,16 @@ class Copy:
         """
         path = self.folder / change.file
         before, date = path.read_text(encoding="utf-8"), path.stat().st_mtime_ns
-        kernels = set((self.folder / KERNELS).glob("*"))
+        compiled = self.folder / COMPILED
+        kernels = set(compiled.glob("*"))
         path.write_text(change.applied(before), encoding="utf-8")
         try:
             yield
         finally:
             path.write_text(before, encoding="utf-8")
             os.utime(path, ns=(date, date))
-            for folder in set((self.folder / KERNELS).glob("*")) - kernels:
-                if change.file.endswith(("cpu.py", "ssim.py", "constants.py")) or "/cpu/" in (
-                    change.file
-                ):
+            if is_kernel(change.file):
+                for folder in set(compiled.glob("*")) - kernels:
                     shutil.rmtree(folder, ignore_errors=True)
 
 

@@ -4,10 +4,12 @@
     python tests/mutations/run.py --only 3 --only 17      some of them, by their numbers
     python tests/mutations/run.py --sample 200 --seed 0   small changes that are chosen at random
     python tests/mutations/run.py --sample 200 --again    those of them that were not noticed
+    python tests/mutations/run.py --sample 200 --control  the tests that noticed, without a change
 
 Results are appended to a file of JSON lines, one for each change; a sample that was cut short goes
 on where it was. Files that kernels of the CPU are compiled from are left out of a sample unless
---kernels is given: each change compiles all of them anew, which takes minutes.
+--kernels is given: each change compiles anew what its tests need, half a minute or more. "out of
+time" is what ran longer than --limit, such as a loop without an end. For Linux.
 """
 
 from __future__ import annotations
@@ -23,14 +25,12 @@ from queue import SimpleQueue
 from typing import Any
 
 from beside import find_tests
-from changes import Change, listed
-from copies import ROOT, Copy
+from changes import ROOT, Change, is_kernel, listed
+from copies import Copy
 from small_changes import sample
 
-KERNELS = "ops/*/cpu.py", "ops/*/cpu/*.py", "backends/cpu/*.py"
 
-
-def main() -> None:
+def main() -> int:
     asked = _parse()
     asked.folder.mkdir(parents=True, exist_ok=True)
     if asked.sample:
@@ -38,13 +38,16 @@ def main() -> None:
         changes = _drawn(path, asked)
     else:
         path = asked.folder / "listed.jsonl"
-        if not asked.only:
+        if not (asked.only or asked.control):
             path.unlink(missing_ok=True)
         changes = dict(enumerate(listed(), start=1))
     if asked.only:
         changes = {number: changes[number] for number in asked.only}
+    if asked.control:
+        return _control(path, asked)
     _try_all(changes, path, asked)
     _tell(path)
+    return 0
 
 
 def _parse() -> argparse.Namespace:
@@ -56,6 +59,7 @@ def _parse() -> argparse.Namespace:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--kernels", action="store_true", help="change kernels as well")
     parser.add_argument("--again", action="store_true", help="try what was not noticed again")
+    parser.add_argument("--control", action="store_true", help="try the tests without a change")
     parser.add_argument("--workers", type=int, choices=(1, 2), default=1)
     parser.add_argument("--limit", type=float, default=900, help="most seconds for a change")
     parser.add_argument("--folder", type=Path, default=ROOT / "build" / "mutations")
@@ -76,14 +80,10 @@ def _drawn(path: Path, asked: argparse.Namespace) -> dict[int, Change]:
 
 def _draw(asked: argparse.Namespace) -> list[dict[str, Any]]:
     package = ROOT / "gsdmsr_cli"
-    paths = [path for path in package.rglob("*.py") if asked.kernels or not _is_kernel(path)]
-    files = [path.relative_to(ROOT).as_posix() for path in paths]
+    files = [path.relative_to(ROOT).as_posix() for path in package.rglob("*.py")]
+    files = [file for file in files if asked.kernels or not is_kernel(file)]
     chosen = sample(ROOT, files, asked.sample, asked.seed)
     return [{"number": n, "change": asdict(one)} for n, one in enumerate(chosen, start=1)]
-
-
-def _is_kernel(path: Path) -> bool:
-    return any(path.match(pattern) for pattern in KERNELS)
 
 
 def _read(path: Path) -> tuple[dict[int, Change], dict[int, dict[str, Any]]]:
@@ -124,6 +124,17 @@ def _try_all(changes: dict[int, Change], path: Path, asked: argparse.Namespace) 
             file.flush()
             print(f"{row['number']:4} {row['seconds']:6.1f} s  {row['verdict']:12} {row['file']}: "
                   f"{row['name']}  {row['by']}", flush=True)  # fmt: skip
+
+
+def _control(path: Path, asked: argparse.Namespace) -> int:
+    """Run every test that has noticed something without a change; return 1 if one fails then."""
+    rows = _read(path)[1].values()
+    # of parametrized tests all cases: their names may hold what a shell or pytest takes otherwise
+    tests = sorted({row["by"].partition("[")[0] for row in rows if row["verdict"] == "noticed"})
+    tests = [test for test in tests if (ROOT / test.partition("::")[0]).is_file()]
+    outcome = Copy(asked.folder / "copy-0").test(tests, asked.limit)
+    print(f"{len(tests)} tests without a change: {outcome.by or 'none'} fails")
+    return int(bool(outcome.by))
 
 
 def _tell(path: Path) -> None:

@@ -6,8 +6,7 @@ import ast
 
 import pytest
 from beside import find_tests
-from changes import Change, listed
-from copies import ROOT
+from changes import ROOT, Change, is_kernel, listed
 from small_changes import change_of, edits
 
 SOURCE = '''"""Says something."""
@@ -49,6 +48,11 @@ def test_the_nearest_of_equal_places_is_changed() -> None:
     assert Change("", "x.py", "a", "c", line=3).applied(text) == "a\nb\nc\nb\n"
     with pytest.raises(ValueError, match="has 2 times"):
         Change("", "x.py", "a", "c").applied(text)
+
+
+def test_kernels_are_told_apart() -> None:
+    assert is_kernel("gsdmsr_cli/ops/adam/cpu.py") and is_kernel("gsdmsr_cli/ground/ssim.py")
+    assert not is_kernel("gsdmsr_cli/raster/cpu.py")
 
 
 def test_tests_of_a_file_come_before_those_of_its_folder_and_of_others() -> None:
