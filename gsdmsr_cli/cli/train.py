@@ -55,6 +55,9 @@ def train(
         bool, typer.Option("--resume", help="Go on from RUN's last checkpoint.")
     ] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an earlier RUN.")] = False,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Check everything, say what would be done, and stop.")
+    ] = False,
 ) -> None:
     """Reconstruct a moving scene from its pictures."""
     if budget is not None and steps is not None:
@@ -73,7 +76,7 @@ def train(
         "training.keep": keep,
     }
     overrides = [*(set_ or []), *_overrides(options)]
-    command.run(data, out, preset, config, overrides, device, resume, overwrite)
+    command.run(data, out, preset, config, overrides, device, resume, overwrite, dry_run)
 
 
 def _overrides(options: dict[str, str | int | None]) -> list[str]:

@@ -16,12 +16,13 @@ from gsdmsr_cli import raster
 from gsdmsr_cli.backends.cpu.jit import set_threads, threads
 from gsdmsr_cli.backends.cuda import availability
 from gsdmsr_cli.commands._choice import Choice, Chosen
+from gsdmsr_cli.commands._plan import say_plan
 from gsdmsr_cli.commands._progress import progress_bar
 from gsdmsr_cli.commands._results import remove_results
 from gsdmsr_cli.commands._training_display import TrainingDisplay
-from gsdmsr_cli.formats import read_scene
+from gsdmsr_cli.formats import needs_preparing, read_scene
 from gsdmsr_cli.ground import machine, say
-from gsdmsr_cli.ground.errors import UsageError
+from gsdmsr_cli.ground.errors import DataError, UsageError
 from gsdmsr_cli.ground.files import write_json
 from gsdmsr_cli.ground.locks import one_of_readers, sole_writer
 from gsdmsr_cli.options import strict
@@ -35,6 +36,7 @@ from gsdmsr_cli.runs.run import (
     create_run,
     open_run,
     refuse_used,
+    require_apart,
 )
 from gsdmsr_cli.scene.pictures import Pictures
 from gsdmsr_cli.scene.scene import Scene
@@ -60,8 +62,11 @@ def run(
     device: str,
     resume: bool,
     overwrite: bool,
+    dry_run: bool = False,
 ) -> None:
     """Train the scene in ``data`` and write the run folder ``out``.
+
+    With ``dry_run`` only what has been read and checked until then is told, and nothing written.
 
     Raises:
         UsageError: an option does not exist, cannot be changed when resuming, or needs a GPU.
@@ -89,6 +94,8 @@ def run(
         where = raster.pick_device(device)
         _require_precision(options, device, where)
         locks.enter_context(one_of_readers(data))
+        if dry_run and needs_preparing(data):
+            raise DataError(f"{data}: its videos must be decoded, and a dry run writes nothing")
         scene, load_s = _timed(lambda: _read(data))
         if earlier is not None:
             earlier.check_scene(scene)
@@ -98,6 +105,13 @@ def run(
             _say_preset(chosen)
         trainer, prepare_s = _timed(lambda: _prepare(scene, options, where))
         timings = {"load_s": load_s + prepare_s}
+        if dry_run:
+            require_apart(out, scene)
+            if earlier is not None:
+                trainer.restore(checkpoint)
+            name, reason = (earlier or chosen).name, (earlier or chosen).reason
+            say_plan(trainer, name, reason, where)
+            return
         with trainer:
             if not there:
                 locks.enter_context(sole_writer(out))  # made now: bad data leaves no empty folder

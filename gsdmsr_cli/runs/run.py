@@ -223,6 +223,12 @@ def refuse_used(root: Path, overwrite: bool) -> None:
         )
 
 
+def require_apart(root: Path, scene: Scene) -> None:
+    """Raise DataError if the scene lies in the folder ``root``, which a run would replace."""
+    if scene.root.resolve().is_relative_to(root.resolve()):
+        raise DataError(f"{root}: holds the data {scene.root}; choose another --out")
+
+
 def create_run(
     root: Path,
     name: str,
@@ -241,9 +247,8 @@ def create_run(
             holds the scene, or cannot be written.
     """
     refuse_used(root, overwrite)
+    require_apart(root, scene)
     data = scene.root.resolve()
-    if data.is_relative_to(root.resolve()):
-        raise DataError(f"{root}: holds the data {scene.root}; choose another --out")
     if root.exists():
         _clear(root)
     run = Run(root, name, preset, facts, data, scene.layout, scene.fingerprint, reason)

@@ -24,13 +24,23 @@ Gsdmsr = Any  # the fixture of conftest.py
         (
             "train --data d --out r",
             "train",
-            (Path("d"), Path("r"), None, None, [], "auto", False, False),
+            (Path("d"), Path("r"), None, None, [], "auto", False, False, False),
         ),
         (
             "train --data d --out r --preset dnerf --config f.yaml --set a.b=1 --set a.c=2"
             " --device cpu --resume",
             "train",
-            (Path("d"), Path("r"), "dnerf", Path("f.yaml"), ["a.b=1", "a.c=2"], "cpu", True, False),
+            (
+                Path("d"),
+                Path("r"),
+                "dnerf",
+                Path("f.yaml"),
+                ["a.b=1", "a.c=2"],
+                "cpu",
+                True,
+                False,
+                False,
+            ),
         ),
         ("eval r", "eval", (Path("r"), Evaluation(), Demands(), Output(), None)),
         (

@@ -130,3 +130,41 @@ def test_what_prepare_says_comes_next_can_be_pasted(
     about = json.loads((tmp_path / "runs" / "a scene; (1)" / "run.json").read_text())
     assert about["name"] == "dnerf"  # though the scene folder has nerfstudio's layout
     assert "since the data has the layout dnerf" in capsys.readouterr().err
+
+
+def test_a_dry_run_says_what_would_be_done_and_writes_nothing(
+    tiny_scene: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    run = tmp_path / "run"
+    line = f"gsdmsr train --data {tiny_scene} --out {run} --set splats.count=50"
+    before = sorted(path for path in tiny_scene.rglob("*"))
+    assert gsdmsr(f"{line} --steps 9 --dry-run --json", monkeypatch) == 0
+    plan = json.loads(capsys.readouterr().out)
+    assert not run.exists() and sorted(tiny_scene.rglob("*")) == before
+    assert (plan["preset"], plan["splats"], plan["length"]) == ("dnerf", 50, "9 steps")
+    assert plan["reason"].startswith("preset dnerf, since") and plan["begins_at_step"] == 0
+    assert plan["options"]["splats.count"] == 50 and plan["options"]["density.gradient"] == 7e-4
+    assert "density.cap" not in plan["options"]  # which is the default
+    assert plan["scene"]["pictures"]["train"] == 12 and plan["size"] == [48, 48]
+    assert plan["device"] == "cpu" and 1 <= plan["processes"] <= 2
+    assert gsdmsr(f"{line} --steps 2", monkeypatch) == 0
+    files = {path: path.read_bytes() for path in run.iterdir()}
+    assert gsdmsr(f"{line} --steps 2 --dry-run", monkeypatch) == 3  # RUN is in use
+    assert "--overwrite" in capsys.readouterr().err
+    assert gsdmsr(f"{line} --steps 7 --resume --dry-run", monkeypatch) == 0
+    out = capsys.readouterr().out
+    assert "begins at step │ 2" in out and "nothing has been written" in out
+    assert {path: path.read_bytes() for path in run.iterdir()} == files
+
+
+def test_a_dry_run_does_not_decode_videos(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "cam00.mp4").write_bytes(b"")
+    (tmp_path / "poses_bounds.npy").write_bytes(b"")
+    line = f"gsdmsr train --data {tmp_path} --out {tmp_path / 'run'} --dry-run"
+    assert gsdmsr(line, monkeypatch) == 3
+    assert "a dry run writes nothing" in capsys.readouterr().err

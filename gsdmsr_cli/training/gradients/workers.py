@@ -23,6 +23,12 @@ from gsdmsr_cli.training.gradients.shared_buffers import SharedBuffers
 T = TypeVar("T")
 
 
+def processes_for(views: int) -> int:
+    """Return how many processes share a step's views, as far as there are threads for them."""
+    forks = sys.platform.startswith("linux") and jit.may_fork()
+    return min(views, jit.threads()) if forks else 1
+
+
 class WorkerPool:
     """This process and its workers, if it has any; without, it renders all views by itself.
 
@@ -53,8 +59,8 @@ class WorkerPool:
             prepare: what each worker does before its first orders.
         """
         self._threads = jit.threads()
-        count = min(views, self._threads)
-        if count < 2 or not sys.platform.startswith("linux") or not jit.may_fork():
+        count = processes_for(views)
+        if count < 2:
             return
         jit.set_threads(self._threads // count)
         self._published = SharedBuffers(model.parameters(), capacity)
