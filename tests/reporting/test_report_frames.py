@@ -97,3 +97,9 @@ def test_pictures_are_those_that_were_compared(view: View) -> None:
         left, right = pixels_of(frame.error)[100:400, [200, 600]].mean(0)
         assert np.abs(left - right).max() > 20  # another error, another colour
         assert pixels_of(frame.thumbnail).shape == (64, 96, 3)
+
+
+def test_four_of_the_worst_and_four_of_the_best_are_shown() -> None:
+    frames = [{"psnr": float(psnr)} for psnr in (5, 9, 1, 7, 3, 8, 2, 6, 4, 10)]
+    assert choose(frames) == ([2, 6, 4, 8], [9, 1, 5, 3])
+    assert choose(frames[:3]) == ([2, 0], [1])

@@ -19,7 +19,7 @@ from gsdmsr_cli.scene.pictures import Pictures
 from gsdmsr_cli.scene.scene import Scene, View
 from gsdmsr_cli.training.starting.initial import initial_splats
 from gsdmsr_cli.training.starting.sightings import colours_of, places
-from gsdmsr_cli.training.starting.surfaces import sample_points
+from gsdmsr_cli.training.starting.surfaces import _Album, sample_points
 
 WALL = 1.0
 """The wall is the plane y = 1; cameras look at it from about y = -3."""
@@ -143,3 +143,41 @@ def test_places_are_pixels(shift: float) -> None:
     column, row, shown = places(points, camera)
     assert column[:2].tolist() == pytest.approx([5, 4 + 10 * (0.2 + shift) / 2])
     assert row[0].item() == pytest.approx(4) and shown.tolist() == [True, True, False, False]
+
+
+def album_of(cameras: list[Camera], times: list[float], mask: Tensor | None = None) -> _Album:
+    """Views of pictures that are not larger than what is worked on."""
+    views = [
+        View(str(i), camera, time, "train", Path())
+        for i, (camera, time) in enumerate(zip(cameras, times, strict=True))
+    ]
+    pictures = Album([torch.zeros(3, camera.height, camera.width) for camera in cameras])
+    pictures.signal = lambda view, name: mask  # type: ignore[method-assign]
+    nothing = np.zeros((0, 3), np.float32)
+    scene = Scene(Path(), "test", tuple(views), nothing, None, None, 1.0, "")
+    return _Album(scene, pictures)
+
+
+def test_partners_are_near_but_not_at_one_place_with_each_other() -> None:
+    """Cameras on a line at 0, 0.1, 1, 1.1, 2 and so on: of each pair one is enough."""
+    places = [i + 0.1 * second for i in range(5) for second in (0, 1)]
+    cameras = []
+    for x in places:
+        pose = np.eye(4)
+        pose[0, 3] = -x
+        cameras.append(Camera(pose, 50.0, 50.0, 15.0, 10.0, 30, 20))
+    album = album_of(cameras, [0.0] * 10)
+    assert album.partners(0) == [2, 4, 6, 8]
+    assert album.partners(9) == [7, 5, 3, 1]
+    # a moment is worth as much as the spread of the cameras, which is 2.05
+    album = album_of(cameras, [0.0, 0.0, 1.0, *[0.0] * 7])
+    assert album.partners(0) == [3, 4, 6, 8]
+
+
+def test_pixels_count_by_the_mask_whose_size_is_its_own() -> None:
+    """Of 60 x 40 px, over a picture of 30 x 20."""
+    mask = torch.zeros(40, 60, dtype=torch.bool)
+    mask[30:, 45:] = True
+    album = album_of([Camera(np.eye(4), 50.0, 50.0, 15.0, 10.0, 30, 20)], [0.0], mask)
+    pixels = torch.tensor([[22.4, 15.1], [22.6, 15.1], [22.6, 14.9], [29.9, 19.9], [0.0, 0.0]])
+    assert album.counted(0, pixels).tolist() == [False, True, False, True, False]
