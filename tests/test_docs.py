@@ -45,7 +45,7 @@ ROOT = Path(__file__).parent.parent
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")])
 COMMANDS = (
     "prepare", "train", "eval", "render", "export", "info", "demo", "presets", "doctor", "weights",
-    "benchmark",
+    "cache", "benchmark",
 )  # fmt: skip
 
 

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from gsdmsr_cli.cli.options import Background
+from gsdmsr_cli.cli.options import Background, preset_names
 from gsdmsr_cli.ground.errors import UsageError
 
 
@@ -39,7 +39,8 @@ def scenes(
     folders: Annotated[list[Path], typer.Argument(metavar="SCENE...", help="Scene folders.")],
     out: Annotated[Path, typer.Option(metavar="DIR", help="Folder of the runs and the table.")],
     preset: Annotated[
-        list[str] | None, typer.Option(metavar="NAME", help="Preset; repeatable.")
+        list[str] | None,
+        typer.Option(metavar="NAME", help="Preset; repeatable.", autocompletion=preset_names),
     ] = None,
     config: Annotated[
         list[Path] | None,

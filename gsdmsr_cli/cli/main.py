@@ -18,6 +18,7 @@ import typer
 
 from gsdmsr_cli.cli import (
     benchmark,
+    cache,
     demo,
     doctor,
     export,
@@ -38,14 +39,14 @@ from gsdmsr_cli.ground.streams import unfailing
 # These files import gsdmsr_cli.commands in the functions that run them: torch alone would make
 # --help slow.
 _COMMANDS = (
-    prepare, train, evaluate, render, export, info, demo, presets, doctor, weights, benchmark,
+    prepare, train, evaluate, render, export, info, demo, presets, doctor, weights, cache,
+    benchmark,
 )  # fmt: skip
 """In the order of --help."""
 
 app = typer.Typer(
     help="Dynamic 3D Gaussian splatting: train, render, measure and export.",
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
 )
 for _command in _COMMANDS:

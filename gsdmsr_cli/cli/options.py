@@ -12,3 +12,10 @@ MovedData = Annotated[
     Path | None, typer.Option("--data", metavar="DIR", help="Where the data lies now, if moved.")
 ]
 Background = Literal["white", "black"]
+
+
+def preset_names(incomplete: str) -> list[str]:
+    """Return the presets that a shell may complete a name to."""
+    from gsdmsr_cli.options import preset_files  # which takes as long as the rest of --help
+
+    return [name for name in preset_files.preset_names() if name.startswith(incomplete)]

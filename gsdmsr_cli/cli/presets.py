@@ -6,6 +6,8 @@ from typing import Annotated
 
 import typer
 
+from gsdmsr_cli.cli.options import preset_names
+
 
 def register(app: typer.Typer) -> None:
     """Add the command."""
@@ -14,7 +16,10 @@ def register(app: typer.Typer) -> None:
 
 def presets(
     name: Annotated[
-        str | None, typer.Argument(metavar="NAME", help="Preset whose options are listed.")
+        str | None,
+        typer.Argument(
+            metavar="NAME", help="Preset whose options are listed.", autocompletion=preset_names
+        ),
     ] = None,
 ) -> None:
     """List presets, or all options of one with their meanings."""

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from gsdmsr_cli.cli.options import Background
+from gsdmsr_cli.cli.options import Background, preset_names
 from gsdmsr_cli.ground.errors import UsageError
 
 
@@ -21,7 +21,8 @@ def train(
     data: Annotated[Path, typer.Option(metavar="DIR", help="Scene folder, such as a D-NeRF one.")],
     out: Annotated[Path, typer.Option(metavar="RUN", help="Run folder to write.")],
     preset: Annotated[
-        str | None, typer.Option(metavar="NAME", help="Preset to start from.")
+        str | None,
+        typer.Option(metavar="NAME", help="Preset to start from.", autocompletion=preset_names),
     ] = None,
     config: Annotated[
         Path | None, typer.Option(metavar="F.yaml", help="File of options over the preset.")

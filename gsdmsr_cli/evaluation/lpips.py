@@ -137,6 +137,12 @@ def hub_folder() -> Path:
     return Path(torch.hub.get_dir()) / "checkpoints"
 
 
+def weights_in_hub() -> list[Path]:
+    """Return the files of weights that ``find_weights`` would use of torch's folder."""
+    named = [name for net in NETS for names in _names(net).values() for name in names]
+    return [path for path in (hub_folder() / name for name in named) if path.is_file()]
+
+
 def find_weights(net: str, folder: Path | None = None) -> dict[str, Path | Missing]:
     """Return the files of the "trunk" and the "linear" layers, or why there is none.
 

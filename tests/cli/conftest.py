@@ -13,7 +13,7 @@ from gsdmsr_cli.cli.main import main
 
 COMMANDS = (
     "prepare", "train", "eval", "render", "export", "info", "demo", "presets", "doctor", "weights",
-    "benchmark_kernels", "benchmark_scenes", "benchmark_resume", "benchmark_still",
+    "cache",     "benchmark_kernels", "benchmark_scenes", "benchmark_resume", "benchmark_still",
     "benchmark_soak", "benchmark_reading",
 )  # fmt: skip
 

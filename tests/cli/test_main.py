@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -42,6 +43,32 @@ def test_help_is_fast_and_lists_every_command() -> None:
     assert done.returncode == 0
     for name in ("train", "eval", "render", "export", "demo", "doctor", "benchmark"):
         assert name in done.stdout
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        ("gsdmsr tr", {"train"}),
+        ("gsdmsr train --preset d", {"default", "dnerf", "dynamic-object"}),
+        ("gsdmsr presets n", {"n3v", "nerfies"}),
+        ("gsdmsr export run --format ply-", {"ply-sequence"}),
+        ("gsdmsr benchmark scenes s --preset hex", {"hexplane"}),
+        ("gsdmsr train --dr", {"--dry-run"}),
+    ],
+)
+def test_a_shell_completes_commands_presets_and_formats(words: str, expected: set[str]) -> None:
+    asked = {"_GSDMSR_COMPLETE": "complete_bash", "COMP_WORDS": words}
+    asked["COMP_CWORD"] = str(len(words.split()) - 1)
+    done = subprocess.run(
+        [sys.executable, "-m", "gsdmsr_cli"],
+        capture_output=True, text=True, timeout=60, check=False, env=os.environ | asked,
+    )  # fmt: skip
+    assert set(done.stdout.split()) == expected, done.stderr
+
+
+def test_the_script_for_completion_is_shown() -> None:
+    done = python("-m", "gsdmsr_cli", "--show-completion", "bash")
+    assert done.returncode == 0 and "_GSDMSR_COMPLETE=complete_bash" in done.stdout
 
 
 def test_the_command_line_imports_nothing_heavy() -> None:
