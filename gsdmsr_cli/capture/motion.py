@@ -37,7 +37,7 @@ Floats32 = NDArray[np.float32]
 def write_found_masks(
     folder: Path, frames: Frames, found: Reconstruction, on_progress: OnProgress
 ) -> None:
-    """Write a mask for every frame, empty where it has no camera.
+    """Write a mask for every frame, empty where it has no camera or nothing to be compared with.
 
     Args:
         folder: to write.
@@ -57,7 +57,7 @@ def write_found_masks(
         votes = [
             _off_lines(greys[i], greys[j], rays, essential_matrix(found.poses[i], found.poses[j]))
             for j in others
-        ]
+        ] or [np.zeros((height, width))]
         masks[name] = _cleaned(np.mean(votes, axis=0) * lens.fx > OFF)
         on_progress(i + 1, len(found.names))
     for name in frames.names:
