@@ -14,11 +14,13 @@ from pathlib import Path
 from typing import Any
 
 from gsdmsr_cli.benchmark.calls import Line, call, call_side_by_side
+from gsdmsr_cli.evaluation.lpips import weights_hashes
 from gsdmsr_cli.formats import read_scene
 from gsdmsr_cli.ground.errors import DataError
 from gsdmsr_cli.ground.files import read_json
 from gsdmsr_cli.ground.machine import cores
 from gsdmsr_cli.options.preset import Preset, load_preset
+from gsdmsr_cli.runs.checkpoints import Checkpoint
 from gsdmsr_cli.runs.run import Run, is_run, open_run
 
 
@@ -175,7 +177,7 @@ def _left_to_do(trial: Trial, root: Path, terms: Terms) -> Iterator[Line]:
         kind = "--config" if isinstance(trial.preset, Path) else "--preset"
         yield ["train", *places, kind, str(trial.preset), *settings, how]
         saved = None
-    if saved is None or not _is_report_of(_report_path(trial, root), saved.step, terms):
+    if saved is None or not _is_report_of(_report_path(trial, root), saved, terms):
         weights = ["--lpips-weights", str(terms.lpips_weights)] if terms.lpips_weights else []
         yield ["eval", str(folder), "--split", terms.split, "--data", str(trial.scene), *weights]
 
@@ -189,11 +191,16 @@ def _require_same(run: Run, trial: Trial, terms: Terms) -> None:
     run.check_scene(read_scene(trial.scene))
 
 
-def _is_report_of(path: Path, step: int, terms: Terms) -> bool:
-    """Return whether ``path`` is a report of the checkpoint at this step on these terms."""
+def _is_report_of(path: Path, saved: Checkpoint, terms: Terms) -> bool:
+    """Return whether ``path`` is a report of this checkpoint on these terms.
+
+    One that knows of no weights of LPIPS, where there are some now, or of others, is not.
+    """
     if not path.is_file():
         return False
     about = read_json(path)["protocol"]
-    found = about["split"], about["background"], about["downscale"]
-    wanted = terms.split, terms.background, terms.downscale
-    return found == wanted and about["checkpoint_step"] == step
+    found = about["split"], about["background"], about["downscale"], about.get("checkpoint_sha256")
+    wanted = terms.split, terms.background, terms.downscale, saved.sha256
+    weights, known = weights_hashes(terms.lpips_weights), about.get("lpips_weights", {})
+    same = all(known.get(net) == hashes for net, hashes in weights.items() if hashes is not None)
+    return found == wanted and same

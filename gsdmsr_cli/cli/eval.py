@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from gsdmsr_cli.cli.options import MovedData, RunFolder
+from gsdmsr_cli.cli.options import MovedData, RunFolder, VerifyData
 
 
 def register(app: typer.Typer) -> None:
@@ -60,11 +60,12 @@ def evaluate(
         bool, typer.Option("--report", help="Write report.html and report.md too.")
     ] = False,
     data: MovedData = None,
+    verify_data: VerifyData = False,
 ) -> None:
     """Measure a run on views it has not seen."""
     from gsdmsr_cli.evaluation.request import Demands, Output, Request
 
-    request = Request(split, background, downscale, lpips_weights, lpips_inria)
+    request = Request(split, background, downscale, lpips_weights, lpips_inria, verify_data)
     demands = Demands(
         tuple(fail_under or ()), tuple(fail_over or ()), baseline, tuple(tolerance or ())
     )

@@ -11,6 +11,9 @@ RunFolder = Annotated[Path, typer.Argument(metavar="RUN", help="Folder that trai
 MovedData = Annotated[
     Path | None, typer.Option("--data", metavar="DIR", help="Where the data lies now, if moved.")
 ]
+VerifyData = Annotated[
+    bool, typer.Option("--verify-data", help="Compare every byte of the pictures, not samples.")
+]
 Background = Literal["white", "black"]
 
 

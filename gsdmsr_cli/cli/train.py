@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from gsdmsr_cli.cli.options import Background, preset_names
+from gsdmsr_cli.cli.options import Background, VerifyData, preset_names
 from gsdmsr_cli.ground.errors import UsageError
 
 
@@ -59,6 +59,7 @@ def train(
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Check everything, say what would be done, and stop.")
     ] = False,
+    verify_data: VerifyData = False,
 ) -> None:
     """Reconstruct a moving scene from its pictures."""
     if budget is not None and steps is not None:
@@ -77,7 +78,8 @@ def train(
         "training.keep": keep,
     }
     overrides = [*(set_ or []), *_overrides(options)]
-    command.run(data, out, preset, config, overrides, device, resume, overwrite, dry_run)
+    given = preset, config, overrides, device, resume, overwrite, dry_run, verify_data
+    command.run(data, out, *given)
 
 
 def _overrides(options: dict[str, str | int | None]) -> list[str]:

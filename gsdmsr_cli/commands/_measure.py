@@ -10,6 +10,7 @@ from gsdmsr_cli.commands._progress import part_of, progress_bar
 from gsdmsr_cli.commands._trained import Trained
 from gsdmsr_cli.evaluation import protocol
 from gsdmsr_cli.evaluation.catalogue import PARTS, Metric, load_metrics
+from gsdmsr_cli.evaluation.lpips import weights_hashes
 from gsdmsr_cli.evaluation.metrics import Missing
 from gsdmsr_cli.evaluation.request import BOTH, Request
 from gsdmsr_cli.evaluation.speed import measure_speed
@@ -17,6 +18,7 @@ from gsdmsr_cli.evaluation.summary import SCHEMA
 from gsdmsr_cli.ground import machine
 from gsdmsr_cli.ground.files import read_json
 from gsdmsr_cli.options.preset import BACKGROUNDS
+from gsdmsr_cli.scene.picture_hashes import digest
 from gsdmsr_cli.scene.scene import SPLITS, View
 from gsdmsr_cli.training.timings import timings_of
 
@@ -127,6 +129,8 @@ def describe(trained: Trained, request: Request) -> dict[str, Any]:
         "motion": options.motion["name"],
         "seed": options.training.seed,
         "data_fingerprint": trained.run.fingerprint,
+        "pictures_fingerprint": digest(trained.scene.pictures),
+        "lpips_weights": weights_hashes(request.lpips_weights),
         "conventions": protocol.CONVENTIONS,
         "versions": machine.versions(),
     }

@@ -18,6 +18,7 @@ from gsdmsr_cli.model.model import Model
 from gsdmsr_cli.options.preset import BACKGROUNDS
 from gsdmsr_cli.runs.checkpoints import Checkpoint
 from gsdmsr_cli.runs.run import Run, open_with_model
+from gsdmsr_cli.runs.seen_pictures import check_whole
 from gsdmsr_cli.scene.pictures import Pictures
 from gsdmsr_cli.scene.scene import Scene
 
@@ -43,7 +44,11 @@ class Trained:
 
 @contextmanager
 def open_trained(
-    folder: Path, data: Path | None, background: str | None = None, downscale: int | None = None
+    folder: Path,
+    data: Path | None,
+    background: str | None = None,
+    downscale: int | None = None,
+    verify: bool = False,
 ) -> Iterator[Trained]:
     """Open a run with its data, which nobody replaces until the end of the block.
 
@@ -52,6 +57,7 @@ def open_trained(
         data: where the data lies now, if not where it lay in training.
         background: "white" or "black", if not the one of training.
         downscale: divisor of the pictures' sides, if not the one of training.
+        verify: whether every byte of the pictures must be as it was in training.
 
     Raises:
         DataError: the run or its data cannot be used, or do not belong together.
@@ -59,6 +65,8 @@ def open_trained(
     run, model, checkpoint = open_with_model(folder)
     with one_of_readers(data or run.data):
         scene = _read_data(run, data)
+        if verify:
+            check_whole(run.root, scene)
         renderer, device = _renderer(run, model, background, downscale)
         yield Trained(run, checkpoint, scene, renderer, device)
 

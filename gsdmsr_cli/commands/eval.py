@@ -52,7 +52,7 @@ def run(
     summary_path = _summary_path() if output.github_summary else None
     background = None if request.background == BOTH else request.background
     with ExitStack() as held:
-        given = run_folder, data, background, request.downscale
+        given = run_folder, data, background, request.downscale, request.verify_data
         trained = held.enter_context(open_trained(*given))
         protocol, folder = describe(trained, request), output.folder or run_folder / EVALUATION
         if gates.baseline:

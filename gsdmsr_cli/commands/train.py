@@ -38,6 +38,7 @@ from gsdmsr_cli.runs.run import (
     refuse_used,
     require_apart,
 )
+from gsdmsr_cli.runs.seen_pictures import check_whole
 from gsdmsr_cli.scene.pictures import Pictures
 from gsdmsr_cli.scene.scene import Scene
 from gsdmsr_cli.training.loop import train
@@ -63,10 +64,12 @@ def run(
     resume: bool,
     overwrite: bool,
     dry_run: bool = False,
+    verify: bool = False,
 ) -> None:
     """Train the scene in ``data`` and write the run folder ``out``.
 
     With ``dry_run`` only what has been read and checked until then is told, and nothing written.
+    ``verify`` asks for hashes of whole pictures, which a resumed training compares.
 
     Raises:
         UsageError: an option does not exist, cannot be changed when resuming, or needs a GPU.
@@ -99,6 +102,8 @@ def run(
         scene, load_s = _timed(lambda: _read(data))
         if earlier is not None:
             earlier.check_scene(scene)
+            if verify:
+                check_whole(out, scene)
         else:
             chosen = choice.suit(scene)
             options = chosen.options
@@ -119,7 +124,7 @@ def run(
                 about = chosen.name, options, trainer.facts, scene
                 if overwrite:
                     remove_results(out)
-                folder = create_run(out, *about, overwrite, chosen.reason)
+                folder = create_run(out, *about, overwrite, chosen.reason, verify)
                 folder.save(trainer.checkpoint())  # a full disk is an error now, not at the end
             else:
                 trainer.restore(checkpoint)

@@ -19,6 +19,10 @@ SAME = ("split", "resolution", "background", "data_fingerprint")
 """What two reports must agree in for their figures to be comparable."""
 
 
+SAME_WHERE_KNOWN = ("pictures_fingerprint",)
+"""What they must agree in if both say it; those of earlier versions do not."""
+
+
 @dataclass(frozen=True)
 class Verdict:
     """The result of one check.
@@ -70,11 +74,7 @@ class Baseline:
     def require_same(self, protocol: Mapping[str, Any]) -> None:
         """Raise DataError unless a report with this protocol can be compared with the baseline."""
         earlier = self.document["protocol"]
-        own, other = (
-            {key: about.get(key) for key in SAME}
-            | {f"conventions.{key}": text for key, text in about.get("conventions", {}).items()}
-            for about in (protocol, earlier)
-        )
+        own, other = _compared(protocol), _compared(earlier)
         for key in own.keys() & other.keys():
             if own[key] != other[key]:
                 raise DataError(
@@ -136,6 +136,18 @@ def read_gates(demands: Demands) -> Gates:
     return Gates(bounds, Baseline(path, read_report(path), tolerances))
 
 
+def _compared(protocol: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what is compared of a report's protocol, where the other has the same keys."""
+    known = {key: protocol[key] for key in SAME_WHERE_KNOWN if protocol.get(key) is not None}
+    conventions, weights = protocol.get("conventions", {}), protocol.get("lpips_weights", {})
+    return (
+        {key: protocol.get(key) for key in SAME}
+        | known
+        | {f"conventions.{key}": text for key, text in conventions.items()}
+        | {f"lpips_weights.{net}": hashes for net, hashes in weights.items() if hashes}
+    )
+
+
 def _threshold(option: str, text: str, less: bool) -> Threshold:
     metric, value = _number(option, text)
     if less_is_better(metric) != less:
@@ -169,8 +181,9 @@ def read_report(path: Path) -> dict[str, Any]:
         raise DataError(f"{path}: is not a report of eval; give a metrics.json that it has written")
     if document.get("schema") != SCHEMA:
         raise DataError(f"{path}: has schema {document.get('schema')}; this version reads {SCHEMA}")
-    if not isinstance(document["protocol"].get("conventions", {}), dict):
-        raise DataError(f"{path}: damaged: its conventions are no JSON object")
+    for key in ("conventions", "lpips_weights"):
+        if not isinstance(document["protocol"].get(key, {}), dict):
+            raise DataError(f"{path}: damaged: its {key} are no JSON object")
     for metric in METRICS:
         _require_number(path, metric, document["aggregate"].get(metric))
     if all(value_of(document["aggregate"], metric) is None for metric in METRICS):

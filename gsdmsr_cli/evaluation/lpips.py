@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 from collections.abc import Mapping
+from functools import cache
 from pathlib import Path
 
 import torch
@@ -23,6 +25,8 @@ FOLDER_VARIABLE = "GSDMSR_LPIPS_DIR"
 _SHIFT = (-0.030, -0.088, -0.188)
 _SCALE = (0.458, 0.448, 0.450)
 _EPSILON = 1e-10
+
+_CHUNK, _DIGITS = 1 << 20, 16
 
 
 class Lpips:
@@ -154,6 +158,35 @@ def find_weights(net: str, folder: Path | None = None) -> dict[str, Path | Missi
         raise UsageError(f"unknown LPIPS network '{net}'; {nearest(net, NETS)}")
     folders = search_folders(folder)
     return {kind: _find(net, kind, names, folders) for kind, names in _names(net).items()}
+
+
+def weights_hashes(folder: Path | None = None) -> dict[str, dict[str, str] | None]:
+    """Return by network the beginnings of its files' SHA-256, None where one is missing.
+
+    Raises:
+        DataError: ``folder`` is not a folder, or a file cannot be read.
+    """
+    found: dict[str, dict[str, str] | None] = {}
+    for net in NETS:
+        hashes = {
+            kind: _hash(path, path.stat().st_mtime_ns)
+            for kind, path in find_weights(net, folder).items()
+            if not isinstance(path, Missing)
+        }
+        found[net] = hashes if len(hashes) == len(_names(net)) else None
+    return found
+
+
+@cache
+def _hash(path: Path, _changed: int) -> str:
+    try:
+        with path.open("rb") as file:
+            state = hashlib.sha256()
+            while chunk := file.read(_CHUNK):
+                state.update(chunk)
+            return state.hexdigest()[:_DIGITS]
+    except OSError as error:
+        raise DataError(f"{path}: cannot be read: {error.strerror or error}") from error
 
 
 def _names(net: str) -> dict[str, tuple[str, ...]]:

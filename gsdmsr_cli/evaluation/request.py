@@ -20,6 +20,7 @@ class Request:
         downscale: divisor of the pictures' sides; that of the training if None.
         lpips_weights: folder of LPIPS weights, if not in the usual places.
         lpips_inria: whether LPIPS on [0, 1] is wanted too.
+        verify_data: whether every byte of the pictures must be as it was in training.
     """
 
     split: str = "test"
@@ -27,6 +28,7 @@ class Request:
     downscale: int | None = None
     lpips_weights: Path | None = None
     lpips_inria: bool = False
+    verify_data: bool = False
 
 
 @dataclass(frozen=True)

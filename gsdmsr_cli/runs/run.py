@@ -1,6 +1,7 @@
 """Reads and writes run folders: the options, checkpoints and the log of a training.
 
     RUN/run.json          preset, facts of the scene, where the data lay, versions
+    RUN/pictures.json     hashes of the scene's pictures
     RUN/metrics.jsonl     one line per report of the training
     RUN/checkpoint.safetensors   the last checkpoint, with its state as JSON in the header
     RUN/checkpoints/             earlier ones, if any are kept: step-001200.safetensors
@@ -31,8 +32,9 @@ from gsdmsr_cli.model.model import Model
 from gsdmsr_cli.options import strict
 from gsdmsr_cli.options.preset import Preset
 from gsdmsr_cli.options.renamed import with_present_names
-from gsdmsr_cli.runs import checkpoints, earlier, log
+from gsdmsr_cli.runs import checkpoints, earlier, log, seen_pictures
 from gsdmsr_cli.runs.checkpoints import LAST, WRONG, Checkpoint
+from gsdmsr_cli.scene.picture_hashes import digest
 from gsdmsr_cli.scene.scene import Scene
 
 SCHEMA = 2
@@ -59,6 +61,7 @@ class Run:
         layout: format of the scene.
         fingerprint: of the scene's layout files.
         reason: which preset the data has called for, and why; None where it was named.
+        pictures: hash of samples of the scene's pictures; None in runs of earlier versions.
     """
 
     root: Path
@@ -69,6 +72,7 @@ class Run:
     layout: str
     fingerprint: str
     reason: str | None = None
+    pictures: str | None = None
 
     @property
     def log_path(self) -> Path:
@@ -99,6 +103,7 @@ class Run:
                 "path": str(self.data),
                 "layout": self.layout,
                 "fingerprint": self.fingerprint,
+                "pictures": self.pictures,
             },
         }
         write_json(self.root / _ABOUT, about)
@@ -110,6 +115,7 @@ class Run:
                 f"{scene.root}: is not the data that {self.root} was trained on (its layout files "
                 "differ); give that folder with --data"
             )
+        seen_pictures.check(self.root, self.pictures, scene)
 
     def log(self, *entries: Mapping[str, Any]) -> None:
         """Append lines to the log; see ``runs.log.append``."""
@@ -237,10 +243,12 @@ def create_run(
     scene: Scene,
     overwrite: bool = False,
     reason: str | None = None,
+    verify: bool = False,
 ) -> Run:
     """Start a run folder; an earlier run there is deleted if ``overwrite`` says so.
 
-    ``reason`` is which preset the data has called for, and why.
+    ``reason`` is which preset the data has called for, and why; ``verify`` says whether hashes of
+    whole pictures are wanted beside those of samples.
 
     Raises:
         DataError: the folder is in use and ``overwrite`` is not set, or is not a run at all, or
@@ -252,7 +260,9 @@ def create_run(
     if root.exists():
         _clear(root)
     run = Run(root, name, preset, facts, data, scene.layout, scene.fingerprint, reason)
+    run = replace(run, pictures=digest(scene.pictures))
     run.describe()
+    seen_pictures.remember(root, scene, verify)
     return run
 
 
@@ -295,6 +305,7 @@ def open_run(root: Path) -> Run:
             str(about["data"]["layout"]),
             str(about["data"]["fingerprint"]),
             about.get("reason"),
+            about["data"].get("pictures"),
         )
     except (UsageError, *WRONG) as error:
         raise DataError(f"{path}: damaged: {error}") from error
@@ -328,7 +339,7 @@ def _clear(root: Path) -> None:
     """
     remove_leftovers(root)
     checkpoints.remove(root)
-    for name in (_LOG, _TRAINING):
+    for name in (_LOG, _TRAINING, seen_pictures.PICTURES):
         (root / name).unlink(missing_ok=True)
 
 

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gsdmsr_cli.ground.errors import DataError
+from gsdmsr_cli.scene import picture_hashes
 from gsdmsr_cli.scene.camera import Camera
 from gsdmsr_cli.scene.lens import Lens
+from gsdmsr_cli.scene.picture_hashes import Hashes
 
 SPLITS = ("train", "val", "test")
 
@@ -57,7 +60,8 @@ class Scene:
         duration: length of the capture [s], or None where the format does not say.
         bound: half edge of the box around the world's origin that holds what is to be
             reconstructed [world units], from the format's convention or the points.
-        fingerprint: hash of the layout files, to tell two data sets apart.
+        fingerprint: hash of the layout files, to tell two data sets apart; ``pictures`` does so for
+            the files of the views.
         origin: what ``gsdmsr prepare`` made it from, such as the name of another layout; None where
             it is as it was published.
     """
@@ -71,6 +75,21 @@ class Scene:
     bound: float
     fingerprint: str
     origin: str | None = None
+
+    @property
+    def files(self) -> list[Path]:
+        """The files of all views, pictures and signals, each once."""
+        found = (path for view in self.views for path in (view.image_path, *view.signals.values()))
+        return list(dict.fromkeys(found))
+
+    @cached_property
+    def pictures(self) -> Hashes:
+        """Hashes of samples of the files of all views; they are read at the first call.
+
+        Raises:
+            DataError: one cannot be read.
+        """
+        return picture_hashes.sampled(self.root, self.files)
 
     def split(self, name: str) -> tuple[View, ...]:
         """Return the views of one split.

@@ -119,6 +119,32 @@ def test_another_split_is_only_evaluated(
     assert commands.names() == ["eval"]
 
 
+def test_a_report_without_the_weights_that_there_are_now_is_made_again(
+    copied: Path, tiny_scene: Path, commands: Commands, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """So is one of other weights, and of another checkpoint; not one of more than there is now."""
+    trial = Trial(tiny_scene, "static", STEPS, 1)
+    path = trial.folder(copied) / "eval" / "metrics.json"
+    now = {"alex": {"trunk": "ab", "linear": "cd"}, "vgg": None}
+    monkeypatch.setattr(trials, "weights_hashes", lambda folder: now)
+    commands.true = lambda *line: None
+    for change, again in (
+        ({}, True),
+        ({"lpips_weights": {"alex": None, "vgg": None}}, True),
+        ({"lpips_weights": {"alex": {"trunk": "ab", "linear": "00"}}}, True),
+        ({"lpips_weights": now}, False),
+        ({"lpips_weights": {**now, "vgg": {"trunk": "ef", "linear": "12"}}}, False),
+        ({"lpips_weights": now, "checkpoint_sha256": "of another"}, True),
+    ):
+        document = json.loads((trial.folder(copied) / "eval" / "metrics.json").read_text())
+        before = path.read_bytes()
+        document["protocol"] |= change
+        path.write_text(json.dumps(document))
+        run_trial(trial, copied, TERMS)
+        assert commands.names() == (["eval"] if again else []), change
+        path.write_bytes(before)
+
+
 def test_a_training_that_was_cut_short_goes_on(
     copied: Path, tiny_scene: Path, commands: Commands
 ) -> None:

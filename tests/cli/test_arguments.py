@@ -24,11 +24,11 @@ Gsdmsr = Any  # the fixture of conftest.py
         (
             "train --data d --out r",
             "train",
-            (Path("d"), Path("r"), None, None, [], "auto", False, False, False),
+            (Path("d"), Path("r"), None, None, [], "auto", False, False, False, False),
         ),
         (
             "train --data d --out r --preset dnerf --config f.yaml --set a.b=1 --set a.c=2"
-            " --device cpu --resume",
+            " --device cpu --resume --verify-data",
             "train",
             (
                 Path("d"),
@@ -40,6 +40,7 @@ Gsdmsr = Any  # the fixture of conftest.py
                 True,
                 False,
                 False,
+                True,
             ),
         ),
         ("eval r", "eval", (Path("r"), Evaluation(), Demands(), Output(), None)),
@@ -47,11 +48,11 @@ Gsdmsr = Any  # the fixture of conftest.py
             "eval r --split val --background both --downscale 2 --lpips-weights w --lpips-inria"
             " --json --fail-under psnr=25 --fail-under ssim=0.9 --fail-over lpips_alex=0.1"
             " --baseline b.json --tolerance psnr=0.5 --junit j.xml --github-summary --out o"
-            " --report --data d",
+            " --report --data d --verify-data",
             "eval",
             (
                 Path("r"),
-                Evaluation("val", "both", 2, Path("w"), True),
+                Evaluation("val", "both", 2, Path("w"), True, True),
                 Demands(
                     ("psnr=25", "ssim=0.9"), ("lpips_alex=0.1",), Path("b.json"), ("psnr=0.5",)
                 ),

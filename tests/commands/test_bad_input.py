@@ -190,7 +190,7 @@ def test_overwriting_keeps_the_folder_itself(run: Run, tiny_scene: Path) -> None
     (run.root / "link").symlink_to(tiny_scene, target_is_directory=True)
     before = run.root.stat().st_ino
     create_run(run.root, "again", run.preset, run.facts, read_scene(tiny_scene), overwrite=True)
-    assert {path.name for path in run.root.iterdir()} == {"run.json", "link"}
+    assert {path.name for path in run.root.iterdir()} == {"run.json", "pictures.json", "link"}
     assert run.root.stat().st_ino == before and (tiny_scene / "train").is_dir()
 
 
@@ -278,7 +278,7 @@ def test_what_a_killed_training_was_writing_is_cleared_away(run: Run, tiny_scene
     (run.root / ours / "checkpoint.safetensors").touch()
     continue_run(run, run.preset, read_scene(tiny_scene))
     files = {path.name for path in run.root.iterdir()}
-    assert files == {"run.json", "checkpoint.safetensors", *others}
+    assert files == {"run.json", "pictures.json", "checkpoint.safetensors", *others}
 
 
 @pytest.mark.parametrize(

@@ -113,10 +113,11 @@ def test_a_baseline_with_a_metric_that_is_no_number_is_bad_data(
     assert "\n" not in str(caught.value) and len(str(caught.value)) < 200 + len(str(path))
 
 
-def test_a_baseline_whose_conventions_are_none_is_bad_data(tmp_path: Path) -> None:
+@pytest.mark.parametrize("key", ["conventions", "lpips_weights"])
+def test_a_baseline_whose_conventions_are_none_is_bad_data(tmp_path: Path, key: str) -> None:
     document = report(psnr=25.0)
-    document["protocol"] = PROTOCOL | {"conventions": ["psnr"]}
-    with pytest.raises(DataError, match="its conventions are no JSON object"):
+    document["protocol"] = PROTOCOL | {key: ["psnr"]}
+    with pytest.raises(DataError, match=f"its {key} are no JSON object"):
         read_gates(Demands(baseline=written(tmp_path / "a.json", document)))
 
 
@@ -129,6 +130,20 @@ def test_a_baseline_of_another_protocol_is_refused(key: str, tmp_path: Path) -> 
     with pytest.raises(DataError, match=f"its {key} is .*; a baseline must") as caught:
         gates.baseline.require_same(PROTOCOL | {key: changed})
     assert "\n" not in str(caught.value)
+
+
+def test_pictures_and_weights_must_agree_where_both_state_them(tmp_path: Path) -> None:
+    known = {"pictures_fingerprint": "12", "lpips_weights": {"alex": {"trunk": "ab"}, "vgg": None}}
+    earlier = report(psnr=25.0) | {"protocol": PROTOCOL | known}
+    for document, own in ((report(psnr=25.0), PROTOCOL | known), (earlier, PROTOCOL)):
+        gates = read_gates(Demands(baseline=written(tmp_path / "a.json", document)))
+        assert gates.baseline is not None
+        gates.baseline.require_same(own)  # of before there was either
+    gates.baseline.require_same(PROTOCOL | known | {"lpips_weights": {"vgg": {"trunk": "cd"}}})
+    with pytest.raises(DataError, match="its pictures_fingerprint is '12', not '34' as here"):
+        gates.baseline.require_same(PROTOCOL | known | {"pictures_fingerprint": "34"})
+    with pytest.raises(DataError, match=r"its lpips_weights\.alex is"):
+        gates.baseline.require_same(PROTOCOL | {"lpips_weights": {"alex": {"trunk": "cd"}}})
 
 
 def test_conventions_must_agree_where_both_state_them(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
 from collections.abc import Iterator
 from pathlib import Path
@@ -11,7 +12,7 @@ import torch
 import torch.nn.functional as F  # noqa: N812
 from torch import Tensor
 
-from gsdmsr_cli.evaluation.lpips import NETS, Lpips, load_lpips
+from gsdmsr_cli.evaluation.lpips import NETS, Lpips, load_lpips, weights_hashes
 from gsdmsr_cli.evaluation.lpips_trunks import ARCHITECTURES
 from gsdmsr_cli.evaluation.metrics import Missing
 from gsdmsr_cli.ground.errors import DataError, UsageError
@@ -257,3 +258,14 @@ def test_real_weights_grow_with_the_noise(net: str, shared_data: Path) -> None:
     assert values == sorted(values)
     assert values[0] == 0.0
     assert values[1] > 1e-4
+
+
+def test_weights_are_known_by_the_hashes_of_their_files(made, tmp_path: Path) -> None:
+    net, folder, _, _ = made
+    names = {"trunk": f"{net}.backbone.pth", "linear": f"{net}.pth"}
+    expected = {
+        kind: hashlib.sha256((folder / name).read_bytes()).hexdigest()[:16]
+        for kind, name in names.items()
+    }
+    assert weights_hashes(folder) == {other: expected if other == net else None for other in NETS}
+    assert weights_hashes(tmp_path) == dict.fromkeys(NETS)

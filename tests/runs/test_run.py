@@ -25,6 +25,7 @@ from gsdmsr_cli.options.preset import Preset, load_preset
 from gsdmsr_cli.runs import checkpoints, earlier
 from gsdmsr_cli.runs.checkpoints import Checkpoint
 from gsdmsr_cli.runs.run import Run, continue_run, create_run, open_run, refuse_used
+from gsdmsr_cli.runs.seen_pictures import PICTURES, remember
 from gsdmsr_cli.scene.scene import Scene
 
 FACTS = Facts(bound=1.3, box=((-1.0, -1.1, -1.2), (1.3, 1.2, 1.1)), frames=12)
@@ -56,7 +57,8 @@ def checkpoint_of(step: int = 7) -> Checkpoint:
 
 
 def files_of(run: Run) -> set[str]:
-    return {path.name for path in run.root.iterdir()}
+    """The files of a run but the one that says what its pictures were."""
+    return {path.name for path in run.root.iterdir()} - {PICTURES}
 
 
 def test_a_created_run_is_opened_as_it_was(tmp_path: Path, scene: Scene) -> None:
@@ -216,10 +218,11 @@ def test_the_checkpoint_before_stays_until_the_new_one_can_be_read(
 
 @pytest.mark.skipif(os.name == "nt", reason="Windows has no umask")
 @pytest.mark.parametrize("umask", [0o022, 0o027, 0o077])
-def test_files_have_the_rights_that_the_umask_gives(run: Run, umask: int) -> None:
+def test_files_have_the_rights_that_the_umask_gives(run: Run, scene: Scene, umask: int) -> None:
     before = os.umask(umask)
     try:
         run.describe()
+        remember(run.root, scene, whole=True)
         run.log({"step": 1})
         for step in (7, 8):
             keeping(run, 2).save(checkpoint_of(step))
@@ -377,7 +380,7 @@ def test_replacing_a_run_removes_nothing_that_train_has_not_written(run: Run, sc
         (run.root / name).write_text("of somebody")
     create_run(run.root, "dnerf", Preset(), FACTS, scene, overwrite=True)
     files = {str(path.relative_to(run.root)) for path in run.root.rglob("*") if path.is_file()}
-    assert files == {"run.json", *others}
+    assert files == {"run.json", PICTURES, *others}
 
 
 def test_a_description_of_another_program_is_no_run(tmp_path: Path, scene: Scene) -> None:
