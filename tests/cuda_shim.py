@@ -17,14 +17,21 @@ from gsdmsr_cli.backends.cuda import compiler, launch
 SHIM = Path(__file__).parent / "backends" / "cuda" / "shim"
 MISSING = None if shutil.which("g++") else "there is no g++ to build the kernels for the CPU with"
 _INCLUDED = re.compile(r'#include "(\w+\.cuh)"')
-_KERNEL = re.compile(r'extern "C" __global__ void (?:__launch_bounds__\([^)]*\) )?(\w+)\(')
+_KERNEL = re.compile(
+    r'extern "C" __global__ void (?:__launch_bounds__\((\w+)(?:, \w+)?\) )?(\w+)\('
+)
+
+MOST_THREADS = "1024"
+"""Of a block, on any GPU."""
 
 
-def kernels_of(source: str) -> list[str]:
-    """Return the names of the kernels of a source and of what it includes."""
+def kernels_of(source: str) -> dict[str, str]:
+    """Return the most threads of a block that the kernels of a source, and of what it includes,
+    are made for, an expression in C, by their names."""
     text, headers = compiler.source_path(source).read_text(encoding="utf-8"), compiler.headers()
     included = [headers[name] for name in _INCLUDED.findall(text)]
-    return _KERNEL.findall(text + "".join(path.read_text(encoding="utf-8") for path in included))
+    found = _KERNEL.findall(text + "".join(path.read_text(encoding="utf-8") for path in included))
+    return {kernel: most or MOST_THREADS for most, kernel in found}
 
 
 class Shim:
@@ -50,6 +57,8 @@ class Shim:
     ) -> None:
         if source not in self._libraries:
             self._libraries[source] = ctypes.CDLL(str(self._build(source)))
+        most = getattr(self._libraries[source], f"most_threads_of_{kernel}")()
+        assert 0 < block <= most, f"{kernel} is made for {most} threads, not {block}"
         self._libraries[source].take_turns(ctypes.c_bool(self.backwards))
         getattr(self._libraries[source], f"run_{kernel}")(*grid, block, arguments)
 
@@ -58,7 +67,8 @@ class Shim:
             f'extern "C" void run_{kernel}(int x, int y, int threads, void **given) {{\n'
             f"    auto work = [](void *given) {{ shim::call({kernel}, (void **)given); }};\n"
             f"    shim::run_grid(x, y, threads, work, given);\n}}\n"
-            for kernel in kernels_of(source)
+            f'extern "C" int most_threads_of_{kernel}() {{ return {most}; }}\n'
+            for kernel, most in kernels_of(source).items()
         ]
         runners.append(
             'extern "C" void take_turns(bool backwards) { shim::backwards = backwards; }'
