@@ -149,17 +149,22 @@ def _require_printable(arguments: list[str]) -> None:
 def ctrl_c_that_spares_imports() -> Iterator[None]:
     """Let Ctrl-C raise KeyboardInterrupt, but not in an import: the core of torch would abort.
 
-    SIGTERM, by which containers and schedulers end a process, does what Ctrl-C does at the time.
+    SIGTERM, by which containers and schedulers end a process, and SIGHUP, which comes when a
+    connection or a terminal is closed, do what Ctrl-C does at the time. A SIGHUP that is ignored,
+    as under nohup, stays ignored.
     """
     if threading.current_thread() is not threading.main_thread():
         yield  # where Python allows no handlers
         return
-    before = signal.signal(signal.SIGINT, _interrupt), signal.signal(signal.SIGTERM, _terminate)
+    handlers = {signal.SIGINT: _interrupt, signal.SIGTERM: _terminate}
+    if sys.platform != "win32" and signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
+        handlers[signal.SIGHUP] = _terminate
+    before = {number: signal.signal(number, handler) for number, handler in handlers.items()}
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, before[0])
-        signal.signal(signal.SIGTERM, before[1])
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def _terminate(_number: int, _frame: FrameType | None) -> None:

@@ -15,6 +15,7 @@ import pytest
 import torch
 import typer
 
+from gsdmsr_cli.cli.main import ctrl_c_that_spares_imports
 from gsdmsr_cli.ground.errors import DataError, GsdmsrError, ThresholdError, UsageError
 from gsdmsr_cli.ground.origin import version
 from gsdmsr_cli.ground.printing import is_printable, one_line
@@ -241,3 +242,19 @@ def test_whoever_had_the_signals_before_has_them_afterwards(gsdmsr: Gsdmsr) -> N
     finally:
         for number, handler in zip(numbers, earlier, strict=True):
             signal.signal(number, handler)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no SIGHUP")
+@pytest.mark.parametrize("ignored", [False, True])
+def test_a_terminal_that_is_closed_is_ctrl_c_unless_nohup_is_asked_for(ignored: bool) -> None:
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN if ignored else signal.SIG_DFL)
+    try:
+        with ctrl_c_that_spares_imports():
+            try:
+                signal.raise_signal(signal.SIGHUP)
+                ended = False
+            except KeyboardInterrupt:
+                ended = True
+        assert ended is not ignored
+    finally:
+        signal.signal(signal.SIGHUP, before)

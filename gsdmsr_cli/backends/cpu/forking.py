@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import os
 import select
+import signal
 import struct
 import subprocess
 import sys
@@ -17,6 +18,9 @@ from collections.abc import Callable, Mapping
 
 IDLE_SECONDS = 10.0
 """The process ends after so long without work."""
+
+GRACE_SECONDS = 1.0
+"""The process is killed if it does not end by itself within so long."""
 
 _LENGTH = struct.Struct("<Q")
 _DONE, _FAILED = b"1", b"0"
@@ -78,11 +82,15 @@ class Forks:
         return answer
 
     def _stop(self) -> None:
-        """End the process."""
-        if self._process is not None:
-            self._process.kill()
-            self._process.wait()
+        """Have the process end, which ends what it has forked first."""
+        process = self._process
         self._close()
+        if process is not None:
+            try:
+                process.wait(GRACE_SECONDS)
+            except subprocess.TimeoutExpired:  # it is still importing, or hangs
+                process.kill()
+                process.wait()
 
     def _leave(self) -> None:
         """Leave the process to the one that has started it, of which this one is a fork."""
@@ -132,8 +140,18 @@ def _is_done(work: Callable[[bytes], object], given: bytes) -> bool:
 
 
 def _in_a_fork(work: Callable[[bytes], object], given: bytes) -> bool:
-    """Return whether a process that is forked for it has done a piece of work."""
+    """Return whether a process that is forked for it has done a piece of work.
+
+    It is killed when there is nobody left who waits for the answer.
+    """
+    ended, held = os.pipe()  # the fork holds one end, so that the other tells when it has ended
     pid = os.fork()
     if not pid:
+        os.close(ended)
         os._exit(0 if _is_done(work, given) else 1)
+    os.close(held)
+    # while an answer is waited for, nothing but the end is to be read from who has asked
+    if ended not in select.select([_ASKED, ended], [], [])[0]:
+        os.kill(pid, signal.SIGKILL)
+    os.close(ended)
     return os.waitpid(pid, 0)[1] == 0

@@ -6,7 +6,9 @@ A forked process gets its orders over a pipe; model and gradients lie in memory 
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import multiprocessing
+import os
 import signal
 import traceback
 from collections.abc import Callable, Sequence
@@ -26,6 +28,12 @@ from gsdmsr_cli.training.gradients.renderer import TrainingRenderer
 from gsdmsr_cli.training.gradients.shared_buffers import SharedBuffers
 
 _ON_SCREEN = "on screen"
+
+GRACE_SECONDS = 0.5
+"""A worker is killed if it does not end by itself within so long."""
+
+_PR_SET_PDEATHSIG = 1
+"""Of prctl: the signal that a process gets when the one ends that has forked it."""
 
 
 class Channel(Protocol):
@@ -161,8 +169,8 @@ class ForkedChannel:
     def close(self) -> None:
         """Let the worker end; one that does not is killed."""
         self._pipe.close()
-        self._process.join(timeout=5)
-        if self._process.is_alive():
+        self._process.join(timeout=GRACE_SECONDS)
+        if self._process.is_alive():  # it compiles, or draws a large picture
             self._process.kill()
             self._process.join()
 
@@ -218,6 +226,13 @@ def _received(array: Any) -> Tensor | None:
     return None if array is None else torch.from_numpy(array)
 
 
+def _end_with(training: int) -> None:
+    """Let this process be killed when the training ends in any way, even while it compiles."""
+    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+    if os.getppid() != training:
+        os._exit(1)
+
+
 def _serve(
     pipe: Connection,
     foreign: Sequence[Connection],
@@ -226,6 +241,7 @@ def _serve(
 ) -> None:
     """Do one task after another in a worker, until the training closes the pipe or ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the training to deal with
+    _end_with(os.getppid())
     torch.set_num_threads(1)  # torch's own threads have not come along
     for other in foreign:
         other.close()

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import os
 import signal
+import subprocess
 import sys
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
 import pytest
@@ -27,6 +28,7 @@ def work(given):
     if name == "fails":
         raise ValueError(name)
     if name == "sleeps":
+        Path(folder, "asleep").write_text(str(os.getpid()))
         time.sleep(60)
     about = [str(os.getpid()), str(os.getppid()), " ".join(done), os.environ.get("MARK", "")]
     Path(folder, name).write_text("\\n".join(about))
@@ -101,6 +103,41 @@ def test_work_that_is_given_up_leaves_no_answer_behind(forks: Forks, tmp_path: P
         signal.signal(signal.SIGALRM, before)
     assert not forks.do(f"{tmp_path} fails".encode(), environment())
     assert forks.do(f"{tmp_path} one".encode(), environment())
+
+
+ASKER = """
+import os, sys
+from gsdmsr_cli.backends.cpu.forking import Forks
+
+Forks(sys.argv[1]).do(f"{sys.argv[2]} sleeps".encode(), os.environ)
+"""
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="processes cannot be forked here")
+@pytest.mark.parametrize("end", [signal.SIGKILL, signal.SIGINT], ids=["killed", "interrupted"])
+def test_work_ends_with_who_has_asked_for_it(tmp_path: Path, end: signal.Signals) -> None:
+    command = [sys.executable, "-c", ASKER, CODE, str(tmp_path)]
+    with subprocess.Popen(command, env=environment(), stderr=subprocess.DEVNULL) as asker:
+        asleep = tmp_path / "asleep"
+        wait_until(lambda: asleep.exists() and asleep.read_text() != "")
+        asker.send_signal(end)
+        asker.wait(timeout=20)
+        wait_until(lambda: not is_running(int(asleep.read_text())))
+
+
+def is_running(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    return True
+
+
+def wait_until(holds: Callable[[], bool], seconds: float = 20.0) -> None:
+    end = time.monotonic() + seconds
+    while not holds():
+        assert time.monotonic() < end
+        time.sleep(0.02)
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="processes cannot be forked here")
