@@ -44,7 +44,8 @@ from gsdmsr_cli.training.trainer import Trainer
 ROOT = Path(__file__).parent.parent
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")])
 COMMANDS = (
-    "prepare", "train", "eval", "render", "export", "info", "demo", "presets", "doctor", "weights",
+    "prepare", "train", "eval", "compare", "render", "export", "info", "demo", "presets",
+    "doctor", "weights",
     "cache", "benchmark",
 )  # fmt: skip
 

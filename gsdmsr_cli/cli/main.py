@@ -19,6 +19,7 @@ import typer
 from gsdmsr_cli.cli import (
     benchmark,
     cache,
+    compare,
     demo,
     doctor,
     export,
@@ -39,7 +40,7 @@ from gsdmsr_cli.ground.streams import unfailing
 # These files import gsdmsr_cli.commands in the functions that run them: torch alone would make
 # --help slow.
 _COMMANDS = (
-    prepare, train, evaluate, render, export, info, demo, presets, doctor, weights, cache,
+    prepare, train, evaluate, compare, render, export, info, demo, presets, doctor, weights, cache,
     benchmark,
 )  # fmt: skip
 """In the order of --help."""

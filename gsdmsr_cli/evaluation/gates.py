@@ -23,6 +23,15 @@ SAME_WHERE_KNOWN = ("pictures_fingerprint",)
 """What they must agree in if both say it; those of earlier versions do not."""
 
 
+def differences(
+    one: Mapping[str, Any], other: Mapping[str, Any]
+) -> dict[str, tuple[object, object]]:
+    """Return in which points two protocols differ so that figures cannot be compared."""
+    own, others = _compared(one), _compared(other)
+    shared = [key for key in own if key in others]
+    return {key: (own[key], others[key]) for key in shared if own[key] != others[key]}
+
+
 @dataclass(frozen=True)
 class Verdict:
     """The result of one check.
@@ -73,14 +82,11 @@ class Baseline:
 
     def require_same(self, protocol: Mapping[str, Any]) -> None:
         """Raise DataError unless a report with this protocol can be compared with the baseline."""
-        earlier = self.document["protocol"]
-        own, other = _compared(protocol), _compared(earlier)
-        for key in own.keys() & other.keys():
-            if own[key] != other[key]:
-                raise DataError(
-                    f"{self.path}: its {key} is {_shown(other[key])}, not {_shown(own[key])} as "
-                    "here; a baseline must have been measured by the same protocol"
-                )
+        for key, (own, other) in differences(protocol, self.document["protocol"]).items():
+            raise DataError(
+                f"{self.path}: its {key} is {_shown(other)}, not {_shown(own)} as here; a baseline "
+                "must have been measured by the same protocol"
+            )
 
     def judge(self, aggregate: Mapping[str, Any]) -> list[Verdict]:
         """Return a verdict on every metric that is compared."""

@@ -82,7 +82,7 @@ def make_report_frames(
         frames: their scores, in the same order.
     """
     worst, best = choose(frames)
-    pairs = {i: _pair(renderer, views[i]) for i in (*worst, *best)}
+    pairs = {i: drawn_and_true(renderer, views[i]) for i in (*worst, *best)}
     full = scale_of(np.abs(drawn - true).mean(2) for drawn, true in pairs.values())
     shown = [_report_frame(i, i in worst, *pairs[i], full) for i in (*worst, *best)]
     return shown, full
@@ -94,7 +94,7 @@ def scale_of(errors: Iterable[Floats]) -> float:
     return next((scale for scale in SCALES if scale >= reach), SCALES[-1])
 
 
-def _pair(renderer: ViewRenderer, view: View) -> tuple[Floats, Floats]:
+def drawn_and_true(renderer: ViewRenderer, view: View) -> tuple[Floats, Floats]:
     """Return the drawn and the true picture, (H, W, 3) in [0, 1], no longer than SIDE."""
     drawn, true = quantize(renderer.draw(view)), renderer.true(view)
     return _fitted(drawn.numpy(force=True), SIDE), _fitted(true.numpy(force=True), SIDE)

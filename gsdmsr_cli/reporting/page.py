@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from html import escape
-from importlib import resources
 
 from gsdmsr_cli.evaluation import summary
 from gsdmsr_cli.evaluation.catalogue import METRICS
@@ -13,10 +12,11 @@ from gsdmsr_cli.evaluation.summary import Document, value_of
 from gsdmsr_cli.reporting.frames import ReportFrame
 from gsdmsr_cli.reporting.markup import at, bars, figure, table, terms
 from gsdmsr_cli.reporting.plots import Log, plots
+from gsdmsr_cli.reporting.shell import shell
 from gsdmsr_cli.reporting.viewer import viewer
 from gsdmsr_cli.scene.scene import SPLITS
 
-_POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'unsafe-inline'"
+_FOOTER = "unrounded, in metrics.json beside this page."
 
 _TILE_LPIPS = ("lpips_alex", "lpips_vgg", "lpips_squeeze")
 """The first of these that has a value is shown large."""
@@ -57,8 +57,6 @@ def page(
         full: see ``viewer``.
     """
     about = document["protocol"]
-    own = resources.files(__package__)
-    style, script = (own.joinpath(name).read_text("utf-8") for name in ("page.css", "page.js"))
     lede = (
         f"{summary.title(document)} · on {' and '.join(summary.backgrounds(document))} · "
         f"preset {about['preset']}, motion {about['motion']}, seed {about['seed']}"
@@ -75,32 +73,11 @@ def page(
         _section("Every frame", _frames(document)),
         _section("Protocol", _protocol(document)),
     ]
-    return f"""<!doctype html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-<meta http-equiv="Content-Security-Policy" content="{_POLICY}">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<title>{escape(heading)}: evaluation</title>
-<style>
-{style}</style>
-</head>
-<body>
-<header>
-<p class="kicker">gsdmsr evaluation</p>
-<h1>{escape(heading)}</h1>
-<p class="lede">{escape(lede)}</p>
-{_tiles(document)}
-</header>
-<main>
-{"".join(body)}</main>
-<footer>Written by gsdmsr {escape(about["versions"]["gsdmsr"])}. Every figure here stands,
-unrounded, in metrics.json beside this page.</footer>
-<script>
-{script}</script>
-</body>
-</html>
-"""
+    header = f'<p class="lede">{escape(lede)}</p>\n{_tiles(document)}'
+    version = escape(about["versions"]["gsdmsr"])
+    footer = f"Written by gsdmsr {version}. Every figure here stands,\n{_FOOTER}"
+    title = f"{heading}: evaluation"
+    return shell(title, "gsdmsr evaluation", heading, header, "".join(body), footer, "page.js")
 
 
 def _section(title: str, content: str) -> str:
