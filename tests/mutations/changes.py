@@ -11,6 +11,8 @@ ROOT = Path(__file__).parents[2]
 
 LIST = Path(__file__).parent / "listed.yaml"
 
+SURVIVORS = Path(__file__).parent / "survivors.yaml"
+
 KERNELS = (
     "ops/*/cpu.py", "ops/*/cpu/*.py", "backends/cpu/*.py", "ground/splatting_constants.py",
     "ground/ssim.py",
@@ -54,6 +56,12 @@ class Change:
             raise ValueError(f"{self.file}: has {len(places)} times: {self.old!r}")
         at = min(places, key=lambda i: abs(text.count("\n", 0, i) + 1 - self.line))
         return text[:at] + self.new + text[at + len(self.old) :]
+
+
+def reasons() -> dict[tuple[str, str], str]:
+    """Return why no test is to notice a change, by its file and new text, where that is known."""
+    rows = yaml.safe_load(SURVIVORS.read_text(encoding="utf-8"))
+    return {(row["file"], row["new"]): row["reason"] for row in rows}
 
 
 def listed() -> list[Change]:

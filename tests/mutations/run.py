@@ -25,7 +25,7 @@ from queue import SimpleQueue
 from typing import Any
 
 from beside import find_tests
-from changes import ROOT, Change, is_kernel, listed
+from changes import ROOT, Change, is_kernel, listed, reasons
 from copies import Copy
 from small_changes import sample
 
@@ -143,10 +143,14 @@ def _tell(path: Path) -> None:
     seconds = sum(row["seconds"] for row in verdicts.values())
     told = ", ".join(f"{count} {verdict}" for verdict, count in sorted(counts.items()))
     print(f"{len(verdicts)} changes: {told}; {seconds / 60:.1f} minutes; {path}")
+    known = reasons()
     for number, row in sorted(verdicts.items()):
         if row["verdict"] != "noticed" and number in changes:
             change = changes[number]
-            print(f"\n{number} {change.file}:{change.line} {change.name}: {row['verdict']}")
+            reason = known.get((change.file, change.new), "")
+            print(
+                f"\n{number} {change.file}:{change.line} {change.name}: {row['verdict']}; {reason}"
+            )
             print(_lines("-", change.old) + _lines("+", change.new), end="")
 
 

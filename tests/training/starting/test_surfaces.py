@@ -174,10 +174,14 @@ def test_partners_are_near_but_not_at_one_place_with_each_other() -> None:
     assert album.partners(0) == [3, 4, 6, 8]
 
 
-def test_pixels_count_by_the_mask_whose_size_is_its_own() -> None:
-    """Of 60 x 40 px, over a picture of 30 x 20."""
+@pytest.mark.parametrize("tall", [False, True])
+def test_pixels_count_by_the_mask_whose_size_is_its_own(tall: bool) -> None:
+    """Of 60 x 40 px, over a picture of 30 x 20, or both turned."""
     mask = torch.zeros(40, 60, dtype=torch.bool)
     mask[30:, 45:] = True
-    album = album_of([Camera(np.eye(4), 50.0, 50.0, 15.0, 10.0, 30, 20)], [0.0], mask)
+    width, height = (20, 30) if tall else (30, 20)
+    camera = Camera(np.eye(4), 50.0, 50.0, width / 2, height / 2, width, height)
+    album = album_of([camera], [0.0], mask.T if tall else mask)
     pixels = torch.tensor([[22.4, 15.1], [22.6, 15.1], [22.6, 14.9], [29.9, 19.9], [0.0, 0.0]])
-    assert album.counted(0, pixels).tolist() == [False, True, False, True, False]
+    found = album.counted(0, pixels.flip(1) if tall else pixels)
+    assert found.tolist() == [False, True, False, True, False]
