@@ -11,9 +11,9 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import astuple, dataclass
 from pathlib import Path
-from statistics import median
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gsdmsr_cli.benchmark.calls import start
 from gsdmsr_cli.ground.errors import GsdmsrError
@@ -28,7 +28,8 @@ class Sample:
 
     Attributes:
         elapsed_s: since its start [s].
-        memory_mib: resident memory of their own; what several share counts once [MiB].
+        memory_mib: resident memory of their own; what several share counts once, and pages of
+            files, such as libraries, do not count [MiB].
         shared_mib: resident memory that is meant to be shared, as that of workers [MiB].
         files: open files, pipes and sockets.
         processes: how many there are.
@@ -81,7 +82,7 @@ def take_sample(root: int, elapsed_s: float) -> Sample:
     for pid in family:
         with suppress(OSError):
             sizes = (PROC / str(pid) / "smaps_rollup").read_text(encoding="ascii")
-            memory += _mib(sizes, "Pss_Anon") + _mib(sizes, "Pss_File")
+            memory += _mib(sizes, "Pss_Anon")
             shared += _mib(sizes, "Pss_Shmem")
             files += sum(1 for _ in (PROC / str(pid) / "fd").iterdir())
     return Sample(elapsed_s, memory, shared, files, len(family))
@@ -103,18 +104,30 @@ def _mib(sizes: str, name: str) -> float:
 
 def tenths(samples: Sequence[Sample]) -> list[Sample]:
     """Return the median of each tenth of the samples, in order; fewer where there are fewer."""
-    parts = np.array_split(np.array([astuple(sample) for sample in samples]), 10)
-    return [Sample(*(median(column) for column in part.T)) for part in parts if len(part)]
+    return [_median(part) for part in _parts(samples, 10)]
 
 
 def growth(samples: Sequence[Sample]) -> Sample:
-    """Return by how much each quantity grows in an hour in the second half of the samples.
+    """Return by how much each quantity has grown from the third quarter to the last, per hour.
 
-    The first half has other work: kernels are loaded, pictures kept, splats become more. It is the
-    slope of the line of least squares; ``elapsed_s`` is 3600.
+    Before, there is other work: kernels are loaded, pictures kept, splats become more. Medians of
+    the quarters are compared, or the moment in which the command ends would count.
+
+    Raises:
+        GsdmsrError: there are fewer than four samples.
     """
-    later = np.array([astuple(sample) for sample in samples[len(samples) // 2 :]])
-    if len(later) < 2:
-        raise GsdmsrError("the command has ended before two samples; lower --every")
-    hours = later[:, 0] / 3600
-    return Sample(3600.0, *(float(np.polyfit(hours, column, 1)[0]) for column in later.T[1:]))
+    if len(samples) < 4:
+        raise GsdmsrError("the command has ended before four samples; lower --every")
+    *_, third, last = (np.array(astuple(_median(part))) for part in _parts(samples, 4))
+    slopes = (last - third) / ((last[0] - third[0]) / 3600)
+    return Sample(*slopes.tolist())
+
+
+def _parts(samples: Sequence[Sample], count: int) -> list[NDArray[np.float64]]:
+    """Return equal parts of the samples, (S, 5) each, without those that would be empty."""
+    table = np.array([astuple(sample) for sample in samples])
+    return [part for part in np.array_split(table, count) if len(part)]
+
+
+def _median(part: NDArray[np.float64]) -> Sample:
+    return Sample(*np.median(part, axis=0).tolist())

@@ -62,17 +62,19 @@ def test_a_process_that_has_ended_holds_nothing() -> None:
     assert take_sample(done.pid, 0.0).memory_mib == 0
 
 
-def test_growth_is_that_of_the_second_half() -> None:
+def test_growth_is_that_of_the_second_half_but_for_its_end() -> None:
     early = [Sample(float(s), 1000.0 + 50 * s, 5.0, 10 + s, 1) for s in range(100)]
-    late = [Sample(float(s), 6000.0 + 0.5 * s, 5.0, 110, 3) for s in range(100, 200)]
+    late = [Sample(float(s), 6000.0 + 0.5 * s, 5.0, 110, 3) for s in range(100, 199)]
+    late += [Sample(199.0, 3.0, 0.0, 2, 1)]
     found = growth(early + late)
-    assert found.memory_mib == pytest.approx(1800)
-    assert (found.shared_mib, found.files) == (pytest.approx(0), pytest.approx(0))
+    assert found.elapsed_s == pytest.approx(3600)
+    assert found.memory_mib == pytest.approx(1800, rel=0.03)
+    assert (found.shared_mib, found.files, found.processes) == (0, 0, 0)
     rows = tenths(early + late)
     assert len(rows) == 10
     assert rows[0] == Sample(9.5, 1475.0, 5.0, 19.5, 1)
-    with pytest.raises(GsdmsrError, match="before two samples"):
-        growth(late[:2])
+    with pytest.raises(GsdmsrError, match="before four samples"):
+        growth(late[:3])
 
 
 def test_a_command_is_watched_to_its_end(tmp_path: Path) -> None:
