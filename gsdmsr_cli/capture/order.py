@@ -35,6 +35,10 @@ class Order:
         write_json(stages.root / NOTE, {"order": self._digest()} | publication)
         return publication
 
+    def conclude(self, stages: Stages) -> None:
+        """Forget what was announced: the scene is where it belongs."""
+        (stages.root / NOTE).unlink(missing_ok=True)
+
     def is_published(self, place: Path, stages: Stages) -> bool:
         """Return whether the scene there is what this command had moved before it was killed."""
         try:
@@ -52,7 +56,7 @@ class Order:
 
 def _seen(given: Path) -> Iterator[tuple[str, int, int]]:
     """Yield names, sizes and times of what is given, which tell whether it is still the same."""
-    inside = sorted(given.iterdir()) if given.is_dir() else []
+    inside = sorted(given.rglob("*")) if given.is_dir() else []
     for path in (given.resolve(), *inside):
         stat = path.stat()
         yield str(path), stat.st_size, stat.st_mtime_ns

@@ -31,6 +31,7 @@ from gsdmsr_cli.capture.versions import versions
 from gsdmsr_cli.formats import read_scene
 from gsdmsr_cli.ground.errors import DataError
 from gsdmsr_cli.ground.progress import OnProgress
+from gsdmsr_cli.scene import picture_hashes
 
 ShowProgress = Callable[[str], AbstractContextManager[OnProgress]]
 """Called with the name of a piece of work; yields the function that its progress is reported to."""
@@ -100,7 +101,10 @@ def convert(folder: Path, stages: Stages, show_progress: ShowProgress) -> Path:
         with show_progress("writing the scene") as on_progress:
             write_converted(made, scene, on_progress)
 
-    key = {"layout": scene.layout, "fingerprint": scene.fingerprint, "versions": versions()}
+    key = {
+        "layout": scene.layout, "fingerprint": scene.fingerprint, "versions": versions(),
+        "pictures": picture_hashes.digest(scene.pictures),
+    }  # fmt: skip
     return stages.run("scene", key, make)
 
 

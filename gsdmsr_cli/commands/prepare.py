@@ -88,6 +88,7 @@ def run(
                 publish(scene, place)
             if not keep:
                 stages.remove()
+            order.conclude(stages)
     except KeyboardInterrupt:
         if stages.root.is_dir():
             text = f"interrupted; finished stages are kept in {shlex.quote(str(stages.root))}"

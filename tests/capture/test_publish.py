@@ -21,6 +21,7 @@ from datasets import write_dnerf
 
 from gsdmsr_cli.capture.options import Options
 from gsdmsr_cli.commands import prepare as command
+from gsdmsr_cli.ground import say
 from gsdmsr_cli.ground.errors import DataError, UsageError
 from gsdmsr_cli.ground.locks import one_of_readers, sole_writer
 
@@ -28,7 +29,7 @@ Content = dict[str, bytes]
 
 
 def prepare(given: Path, out: Path, overwrite: bool = False, keep: bool = False) -> None:
-    command.run(given, out, None, None, Options(), overwrite, keep, as_json=True)
+    command.run(given, out, None, None, Options(), overwrite, keep)
 
 
 def content(folder: Path) -> Content:
@@ -183,6 +184,16 @@ def test_a_folder_of_pictures_that_is_a_link_is_refused(given: Path, tmp_path: P
     with pytest.raises(UsageError, match="images: lies in the scene"):
         prepare(given, out, overwrite=True)
     assert (tmp_path / "elsewhere").is_dir()
+
+
+def test_kept_stages_do_not_serve_other_pictures_of_the_same_layout(
+    given: Path, tmp_path: Path
+) -> None:
+    prepare(given, tmp_path / "scene", keep=True)
+    shutil.copyfile(given / "train" / "r_001.png", given / "train" / "r_002.png")
+    prepare(given, tmp_path / "scene", overwrite=True)
+    images = tmp_path / "scene" / "images" / "train_r_001.png", tmp_path / "scene" / "images"
+    assert images[0].read_bytes() == (images[1] / "train_r_002.png").read_bytes()
 
 
 def test_a_scene_is_not_its_own_input(given: Path, tmp_path: Path) -> None:
@@ -358,12 +369,14 @@ def prepare_on_a_full_disk(number: int, given: Path, out: Path, overwrite: bool)
 
 
 def test_the_times_that_are_told_come_to_the_wall_time(
-    given: Path, tmp_path: Path, capsys: Any
+    given: Path, tmp_path: Path, capsys: Any, monkeypatch: Any
 ) -> None:
+    told = list[dict[str, Any]]()
+    monkeypatch.setattr(say, "result", lambda document, *_: told.append(document))
     started = time.perf_counter()
     prepare(given, tmp_path / "scene")
     wall, printed = time.perf_counter() - started, capsys.readouterr()
-    seconds = json.loads(printed.out)["seconds"]
+    seconds = told[0]["seconds"]
     assert {"reading the data set", "writing the scene", "other"} == seconds.keys()
     assert sum(seconds.values()) == pytest.approx(wall, abs=0.03)
     written = json.loads((tmp_path / "scene" / "timings.json").read_text())["seconds"]

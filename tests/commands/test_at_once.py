@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import shutil
+import subprocess
 import sys
 from collections.abc import Callable
 from dataclasses import replace
@@ -202,3 +203,15 @@ def test_a_model_is_read_with_the_options_of_its_own_training(run: Run, monkeypa
     monkeypatch.setattr(Run, "load_model", begin_another)
     found, _, checkpoint = open_with_model(run.root)
     assert found.name == "second" and checkpoint.step == 0
+
+
+def test_of_two_films_of_one_name_that_are_drawn_at_once_one_is_drawn(run: Run) -> None:
+    """In processes of their own; whichever comes second says so, or finds all frames there."""
+    line = [sys.executable, "-m", "gsdmsr_cli", "render", str(run.root), *FILM]
+    both = [subprocess.Popen(line, stderr=subprocess.PIPE, text=True) for _ in "12"]
+    said = [process.communicate(timeout=120)[1] for process in both]
+    codes = sorted(process.returncode for process in both)
+    assert codes in ([0, 0], [0, 3])
+    assert (codes == [0, 3]) == any("orbit: another process is writing there" in s for s in said)
+    frames = sorted(path.name for path in (run.root / "render" / "orbit").iterdir())
+    assert frames == ["0000.png", "0001.png"]

@@ -153,7 +153,8 @@ def test_a_run_of_half_precision_is_drawn_on_the_cpu_but_not_trained_there(
     assert gsdmsr("train", "--data", tiny_scene, "--out", made.root, "--resume") == 2
     assert "training.precision is bf16; allowed on the CPU: float32" in one_line(capsys)
     assert {path: path.read_bytes() for path in made.root.iterdir()} == before
-    renderer = open_trained(made.root, None).renderer
+    with open_trained(made.root, None) as trained:
+        renderer = trained.renderer
     trainer.restore(made.load())
     assert renderer.model.precision == trainer.model.precision == "bf16"
     view = scene.split("test")[0]

@@ -363,7 +363,7 @@ def test_a_sequence_of_splats_moves(gsdmsr: Gsdmsr, run: Path, tmp_path: Path) -
     out = tmp_path / "sequence"
     ended = gsdmsr("export", run, "--format", "ply-sequence", "--frames", 3, "--out", out)
     assert ended.code == 0
-    paths = sorted(out.iterdir())
+    paths = sorted(out.glob("*.ply"))
     assert [path.name for path in paths] == [f"frame000{i}.ply" for i in (1, 2, 3)]
     means = [read_ply(path).means for path in paths]
     assert len({len(m) for m in means}) == 1

@@ -6,6 +6,7 @@ import json
 import os
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -57,6 +58,13 @@ def test_a_process_compiles_nothing_itself(tmp_path: Path) -> None:
     assert [compiled_in(tmp_path) for _ in "12"] == [[[1, 0], [0, 0]]] * 2
     assert len(list(tmp_path.rglob("*.depth_order-*.nbc"))) == 1
     assert len(list(tmp_path.rglob("*._sorted_rows-*.nbc"))) == 1
+
+
+def test_of_two_processes_with_an_empty_cache_one_waits_for_the_other(tmp_path: Path) -> None:
+    with ThreadPoolExecutor(2) as pool:
+        found = list(pool.map(compiled_in, [tmp_path, tmp_path]))
+    assert found == [[[1, 0], [0, 0]]] * 2  # what one has had compiled, both have read
+    assert len(list(tmp_path.rglob("*.depth_order-*.nbc"))) == 1
 
 
 def test_a_process_compiles_what_no_other_can(tmp_path: Path) -> None:
