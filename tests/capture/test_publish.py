@@ -118,10 +118,17 @@ def test_stages_lie_inside_where_nothing_can_be_written_beside(
     out, real = tmp_path / "parent" / "scene", os.access
     out.mkdir(parents=True)
     monkeypatch.setattr(os, "access", lambda path, how: path != out.parent and real(path, how))
-    prepare(given, out, keep=True)
-    assert [path.name for path in out.parent.iterdir()] == ["scene"]
-    assert (out / ".gsdmsr-stages").is_dir()
+    publish, inside = command.publish, list[Path]()
+
+    def note(scene: Path, place: Path) -> None:
+        inside.append(scene.parent)
+        publish(scene, place)
+
+    monkeypatch.setattr(command, "publish", note)
+    prepare(given, out)
     prepare(given, out, overwrite=True)
+    assert inside == [out / ".gsdmsr-stages"] * 2
+    assert [path.name for path in out.parent.iterdir()] == ["scene"]
     assert content(out) == expected
 
 
