@@ -19,7 +19,7 @@ PANELS = {
     "Gates": ("fail_under", "fail_over", "baseline", "tolerance", "junit", "github_summary"),
     "Pictures": ("output", "video", "size", "scale", "supersample", "fps"),
     "Output": (
-        "out", "overwrite", "keep", "keep_stages", "report", "dry_run",
+        "out", "overwrite", "keep", "keep_stages", "report", "dry_run", "tensorboard", "wandb",
     ),
     "Machine": ("device", "threads", "jobs"),
 }  # fmt: skip

@@ -60,6 +60,13 @@ def train(
         bool, typer.Option("--dry-run", help="Check everything, say what would be done, and stop.")
     ] = False,
     verify_data: VerifyData = False,
+    tensorboard: Annotated[
+        bool, typer.Option("--tensorboard", help="Log to RUN/tensorboard too; needs tensorboardX.")
+    ] = False,
+    wandb: Annotated[
+        str | None,
+        typer.Option(metavar="PROJECT", help="Log to Weights & Biases too; needs wandb."),
+    ] = None,
 ) -> None:
     """Reconstruct a moving scene from its pictures."""
     if budget is not None and steps is not None:
@@ -79,7 +86,7 @@ def train(
     }
     overrides = [*(set_ or []), *_overrides(options)]
     given = preset, config, overrides, device, resume, overwrite, dry_run, verify_data
-    command.run(data, out, *given)
+    command.run(data, out, *given, tensorboard, wandb)
 
 
 def _overrides(options: dict[str, str | int | None]) -> list[str]:

@@ -16,6 +16,7 @@ from gsdmsr_cli import raster
 from gsdmsr_cli.backends.cpu.jit import set_threads, threads
 from gsdmsr_cli.backends.cuda import availability
 from gsdmsr_cli.commands._choice import Choice, Chosen
+from gsdmsr_cli.commands._observers import OnReport, find_observers, observing
 from gsdmsr_cli.commands._plan import say_plan
 from gsdmsr_cli.commands._progress import progress_bar
 from gsdmsr_cli.commands._results import remove_results
@@ -41,7 +42,7 @@ from gsdmsr_cli.runs.run import (
 from gsdmsr_cli.runs.seen_pictures import check_whole
 from gsdmsr_cli.scene.pictures import Pictures
 from gsdmsr_cli.scene.scene import Scene
-from gsdmsr_cli.training.loop import train
+from gsdmsr_cli.training.loop import Report, train
 from gsdmsr_cli.training.schedule import new_clock
 from gsdmsr_cli.training.trainer import Trainer
 from gsdmsr_cli.training.warm_up import warm_up, warm_up_motion
@@ -65,11 +66,14 @@ def run(
     overwrite: bool,
     dry_run: bool = False,
     verify: bool = False,
+    tensorboard: bool = False,
+    wandb: str | None = None,
 ) -> None:
     """Train the scene in ``data`` and write the run folder ``out``.
 
     With ``dry_run`` only what has been read and checked until then is told, and nothing written.
-    ``verify`` asks for hashes of whole pictures, which a resumed training compares.
+    ``verify`` asks for hashes of whole pictures, which a resumed training compares. Reports are
+    handed to TensorBoard, and to Weights & Biases under the project ``wandb``, where asked for.
 
     Raises:
         UsageError: an option does not exist, cannot be changed when resuming, or needs a GPU.
@@ -77,6 +81,7 @@ def run(
         KeyboardInterrupt: Ctrl-C ended the training; ``out`` holds a checkpoint to go on from.
     """
     choice = Choice(preset, config, overrides)
+    wanted = find_observers(tensorboard, wandb)
     with ExitStack() as locks:  # the run folder, from before it is read until all is written there
         there = out.is_dir()
         if there:
@@ -132,13 +137,22 @@ def run(
                 folder.rewind_log(trainer.clock.step)
             timings["compile_s"] = _start_work(trainer, where)
             processes = len(trainer.workers)
-            with TrainingDisplay() as display:
-                finished = train(trainer, folder, display.show, _warn)
+            began = trainer.clock.step
+            with TrainingDisplay() as display, observing(wanted, folder, began) as hand_on:
+                finished = train(trainer, folder, _both(display.show, hand_on), _warn)
         account = _write_account(folder, trainer, where, timings, processes)
     _say_end(folder, trainer, data, finished)
     if not finished:
         raise KeyboardInterrupt
     say.result({"run": str(folder.root), "preset": folder.name, "reason": folder.reason, **account})
+
+
+def _both(first: OnReport, second: OnReport) -> OnReport:
+    def show(report: Report) -> None:
+        first(report)
+        second(report)
+
+    return show
 
 
 def _say_preset(chosen: Chosen) -> None:

@@ -24,11 +24,11 @@ Gsdmsr = Any  # the fixture of conftest.py
         (
             "train --data d --out r",
             "train",
-            (Path("d"), Path("r"), None, None, [], "auto", False, False, False, False),
+            (Path("d"), Path("r"), None, None, [], "auto", False, False, False, False, False, None),
         ),
         (
             "train --data d --out r --preset dnerf --config f.yaml --set a.b=1 --set a.c=2"
-            " --device cpu --resume --verify-data",
+            " --device cpu --resume --verify-data --tensorboard --wandb p",
             "train",
             (
                 Path("d"),
@@ -41,6 +41,8 @@ Gsdmsr = Any  # the fixture of conftest.py
                 False,
                 False,
                 True,
+                True,
+                "p",
             ),
         ),
         ("eval r", "eval", (Path("r"), Evaluation(), Demands(), Output(), None)),
