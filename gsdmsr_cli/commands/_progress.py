@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
@@ -33,7 +34,9 @@ def progress_bar(description: str, console: Console | None = None) -> Iterator[O
     hidden = not (console.is_terminal and say.shows_progress())
     with Progress(*columns, console=console, transient=True, disable=hidden) as progress:
         task = progress.add_task(description, total=None)
+        started = time.perf_counter()
         yield lambda done, total: progress.update(task, completed=done, total=total)
+    say.detail(f"{description}: {time.perf_counter() - started:.1f} s")
 
 
 def part_of(on_progress: OnProgress, before: int, total: int) -> Callable[[int], None]:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import io
+import re
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from rich.console import Console
 
+from gsdmsr_cli.commands._progress import progress_bar
 from gsdmsr_cli.commands._training_display import TrainingDisplay, describe
 from gsdmsr_cli.ground import say
 from gsdmsr_cli.training.loop import Report
@@ -59,3 +61,15 @@ def test_quiet_shows_nothing(capsys: pytest.CaptureFixture[str]) -> None:
 def test_a_terminal_gets_a_bar() -> None:
     text = shown(3, terminal=True)
     assert "training" in text and "100%  step 3  val PSNR 29.76" in text
+
+
+@pytest.mark.parametrize(("level", "lines"), [(say.DETAILS, 1), (say.NOTES, 0)])
+def test_verbose_says_how_long_a_piece_of_work_took(
+    level: int, lines: int, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with say.on_its_own():
+        say.speak_up_to(level)
+        with progress_bar("reading [a] scene") as on_progress:
+            on_progress(1, 2)
+    err = capsys.readouterr().err
+    assert len(re.findall(r"^reading \[a\] scene: 0\.\d s$", err, re.M)) == lines
