@@ -133,8 +133,10 @@ def _control(path: Path, asked: argparse.Namespace) -> int:
     tests = sorted({row["by"].partition("[")[0] for row in rows if row["verdict"] == "noticed"})
     tests = [test for test in tests if (ROOT / test.partition("::")[0]).is_file()]
     outcome = Copy(asked.folder / "copy-0").test(tests, asked.limit)
-    print(f"{len(tests)} tests without a change: {outcome.by or 'none'} fails")
-    return int(bool(outcome.by))
+    passed = outcome.verdict == "not noticed"
+    told = "all pass" if passed else f"{outcome.verdict} {outcome.by}"
+    print(f"{len(tests)} tests without a change, {outcome.seconds} s: {told}")
+    return int(not passed)
 
 
 def _tell(path: Path) -> None:
