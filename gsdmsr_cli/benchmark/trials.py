@@ -18,7 +18,7 @@ from gsdmsr_cli.evaluation.lpips import weights_hashes
 from gsdmsr_cli.formats import read_scene
 from gsdmsr_cli.ground.errors import DataError
 from gsdmsr_cli.ground.files import read_json
-from gsdmsr_cli.ground.machine import cores
+from gsdmsr_cli.ground.limits import cores
 from gsdmsr_cli.options.preset import Preset, load_preset
 from gsdmsr_cli.runs.checkpoints import Checkpoint
 from gsdmsr_cli.runs.run import Run, is_run, open_run

@@ -9,7 +9,6 @@ the pairs are shared out among processes.
 
 from __future__ import annotations
 
-import os
 import shutil
 import sys
 import threading
@@ -24,6 +23,7 @@ from gsdmsr_cli.capture.features import read_features
 from gsdmsr_cli.capture.masks import read_mask, standing
 from gsdmsr_cli.ground.errors import DataError, GsdmsrError
 from gsdmsr_cli.ground.files import write_json
+from gsdmsr_cli.ground.limits import cores
 from gsdmsr_cli.scene.native import load_pycolmap
 
 PAIRS_AT_ONCE = 40
@@ -74,7 +74,7 @@ def match(
 
 def _match_apart(out: Path, pairs: Sequence[tuple[str, str]], seed: int) -> list[Path]:
     """Match pairs of names, a share in each process; return the folders of their databases."""
-    processes = max(1, min(os.cpu_count() or 1, len(pairs) // PAIRS_AT_ONCE))
+    processes = max(1, min(cores(), len(pairs) // PAIRS_AT_ONCE))
     cuts = [len(pairs) * k // processes for k in range(processes + 1)]
     done = [0] * processes
     printing = threading.Lock()

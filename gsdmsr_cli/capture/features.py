@@ -6,7 +6,6 @@ normalised to RootSIFT (Arandjelovic & Zisserman 2012), which COLMAP's matcher e
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -15,6 +14,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from gsdmsr_cli.ground.limits import cores
 from gsdmsr_cli.ground.progress import OnProgress
 from gsdmsr_cli.scene.native import cv2
 
@@ -55,7 +55,7 @@ def write_features(
     # a thread per picture, each by itself: the order of what OpenCV's own threads find varies
     threads = cv2.getNumThreads()
     cv2.setNumThreads(1)
-    pool = ThreadPoolExecutor(os.cpu_count())
+    pool = ThreadPoolExecutor(cores())
     try:
         for done, _ in enumerate(pool.map(work, pictures), start=1):
             on_progress(done, len(pictures))

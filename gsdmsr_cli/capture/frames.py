@@ -17,6 +17,7 @@ from gsdmsr_cli.capture.exif import ExifTags, read_exif, upright
 from gsdmsr_cli.capture.source import Source
 from gsdmsr_cli.ground.errors import DataError
 from gsdmsr_cli.ground.files import read_json, write_json
+from gsdmsr_cli.ground.limits import cores
 from gsdmsr_cli.ground.progress import OnProgress
 from gsdmsr_cli.scene.imaging import read_image, write_png
 from gsdmsr_cli.scene.native import cv2
@@ -215,7 +216,7 @@ def _survey_pictures(source: Source, count: int, on_progress: OnProgress) -> _Su
     times, in_seconds = _picture_times(source.files, [tags[p.name].taken for p in source.files])
     order = np.argsort(times, kind="stable")
     files = [source.files[i] for i in order]
-    with ThreadPoolExecutor() as pool:
+    with ThreadPoolExecutor(cores()) as pool:
         sharpnesses = pool.map(lambda path: sharpness(_rgb(read_image(path, IN_CAPTURES))), files)
         candidates = []
         for i, sharp in zip(order, sharpnesses, strict=True):

@@ -15,7 +15,7 @@ from gsdmsr_cli.formats import read_scene
 from gsdmsr_cli.ground import say
 from gsdmsr_cli.ground.errors import UsageError
 from gsdmsr_cli.ground.files import write_json, write_text
-from gsdmsr_cli.ground.machine import cores
+from gsdmsr_cli.ground.limits import cores
 
 SCHEMA = 1
 

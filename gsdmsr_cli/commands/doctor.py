@@ -18,7 +18,7 @@ from gsdmsr_cli.filming.encode import require_encoder
 from gsdmsr_cli.filming.request import VIDEOS
 from gsdmsr_cli.ground import origin, plugins, say
 from gsdmsr_cli.ground.errors import GsdmsrError
-from gsdmsr_cli.ground.machine import cores
+from gsdmsr_cli.ground.limits import cores
 from gsdmsr_cli.options import preset_files
 
 _PACKAGES = (

@@ -22,7 +22,7 @@ from gsdmsr_cli.commands._progress import progress_bar
 from gsdmsr_cli.commands._results import remove_results
 from gsdmsr_cli.commands._training_display import TrainingDisplay
 from gsdmsr_cli.formats import needs_preparing, read_scene
-from gsdmsr_cli.ground import machine, say
+from gsdmsr_cli.ground import limits, machine, say
 from gsdmsr_cli.ground.errors import DataError, UsageError
 from gsdmsr_cli.ground.files import write_json
 from gsdmsr_cli.ground.locks import one_of_readers, sole_writer
@@ -42,6 +42,7 @@ from gsdmsr_cli.runs.run import (
 from gsdmsr_cli.runs.seen_pictures import check_whole
 from gsdmsr_cli.scene.pictures import Pictures
 from gsdmsr_cli.scene.scene import Scene
+from gsdmsr_cli.training import memory
 from gsdmsr_cli.training.loop import Report, train
 from gsdmsr_cli.training.schedule import new_clock
 from gsdmsr_cli.training.trainer import Trainer
@@ -181,6 +182,7 @@ def _prepare(scene: Scene, options: Preset, device: str) -> Trainer:
     """Return a training that has read its pictures."""
     set_threads(options.training.threads)
     torch.set_num_threads(1)  # what torch itself computes in a step is too little to share
+    _warn_of_memory(scene, options, device)
     pictures = Pictures(
         BACKGROUNDS[options.data.background], options.data.downscale, options.data.cache_mib << 20
     )
@@ -284,6 +286,15 @@ def _write_account(
     }
     write_json(folder.training_path, account)
     return account
+
+
+def _warn_of_memory(scene: Scene, options: Preset, device: str) -> None:
+    """Say so if the training may take more memory than there is."""
+    processes = min(options.training.views_per_step, threads()) if device == "cpu" else 1
+    expected = memory.estimate(scene.split("train"), options, processes)
+    text = memory.warning(expected, limits.available_memory())
+    if text is not None:
+        _warn(text)
 
 
 def _warn(text: str) -> None:

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import json
 import math
-import os
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsdmsr_cli.demo.solids import Ball, Box, Capsule, Disc, Floats, Solid, column, dot
+from gsdmsr_cli.ground.limits import cores
 from gsdmsr_cli.ground.progress import OnProgress
 from gsdmsr_cli.scene.camera import Camera, look_at
 from gsdmsr_cli.scene.imaging import write_png
@@ -235,7 +235,7 @@ def _draw_all(folder: Path, shots: list[Shot], progress: OnProgress | None) -> N
         write_png(folder / f"{shot.name}.png", draw(solids_at(shot.time), shot.camera))
 
     # NumPy lets go of the interpreter in its loops, so threads do share the work.
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
+    with ThreadPoolExecutor(cores()) as pool:
         for done, _ in enumerate(pool.map(work, shots), start=1):
             if progress is not None:
                 progress(done, len(shots))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import queue
 import threading
 from collections import deque
@@ -15,6 +14,8 @@ from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
+
+from gsdmsr_cli.ground.limits import cores
 
 T = TypeVar("T")
 Pixels = NDArray[np.uint8]
@@ -34,7 +35,7 @@ class WriterPool:
 
     def __init__(self, most_jobs: int) -> None:
         self._free = threading.BoundedSemaphore(most_jobs)
-        self._pool = ThreadPoolExecutor(min(MOST_THREADS, os.cpu_count() or 1), "write")
+        self._pool = ThreadPoolExecutor(min(MOST_THREADS, cores()), "write")
         self._jobs: deque[Future[Any]] = deque()
         self._videos: list[VideoWriter] = []
         self._most_jobs = most_jobs

@@ -98,7 +98,7 @@ def _splits(document: dict[str, Any], names: list[str], path: Path) -> list[str 
     found: dict[str, str] = {}
     for key, split in keys.items():
         for name in checks.sequence(document.get(key, []), f"{path}: {key}"):
-            if name not in names:
+            if not isinstance(name, str) or name not in names:
                 raise DataError(f"{path}: {key}: {checks.shown(name)} is the file_path of no frame")
             found.setdefault(name, split)
     return [found.get(name) for name in names]

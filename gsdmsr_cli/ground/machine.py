@@ -29,13 +29,6 @@ def cpu_name() -> str:
     return next(names, platform.processor() or platform.machine())
 
 
-def cores() -> int:
-    """Return how many cores this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
-
-
 def peak_rss_mib(workers: int = 0) -> float | None:
     """Return the most memory this process has held so far [MiB], or None where nobody counts.
 

@@ -84,7 +84,7 @@ class BlockStore:
 
     def put(self, number: int, content: NDArray[np.uint8]) -> None:
         """Keep a copy of the array (size,), unless it is larger than the whole memory."""
-        needed = _blocks(content.size)
+        needed = blocks(content.size)
         if needed > self._count:
             return
         with self._locked():
@@ -114,7 +114,7 @@ class BlockStore:
 
     def fitting(self, sizes: Iterable[int]) -> int:
         """Return how many arrays of these sizes [bytes], from the first on, fit in together."""
-        return sum(end <= self._count for end in accumulate(map(_blocks, sizes)))
+        return sum(end <= self._count for end in accumulate(map(blocks, sizes)))
 
     @contextlib.contextmanager
     def _locked(self) -> Iterator[None]:
@@ -140,7 +140,7 @@ class BlockStore:
         if rows is None or (self._numbers[rows] != number).any():
             rows = np.flatnonzero(self._numbers == number)
             self._places[number] = rows
-        return rows if len(rows) == _blocks(size) else None
+        return rows if len(rows) == blocks(size) else None
 
     def _make_room(self, needed: int) -> NDArray[np.intp]:
         """Return free blocks, after the least recently used arrays have gone as far as need be."""
@@ -158,7 +158,7 @@ class BlockStore:
         self._used[blocks] = _NEVER
 
 
-def _blocks(size: int) -> int:
+def blocks(size: int) -> int:
     """Return how many blocks an array of ``size`` bytes takes."""
     return -(-size // BLOCK)
 

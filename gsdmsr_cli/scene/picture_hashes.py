@@ -15,6 +15,7 @@ from functools import partial
 from pathlib import Path
 
 from gsdmsr_cli.ground.errors import DataError
+from gsdmsr_cli.ground.limits import cores
 
 BLOCK = 4096
 """Bytes of each of the three blocks of a sample."""
@@ -42,7 +43,7 @@ def whole(root: Path, paths: Iterable[Path]) -> Hashes:
         DataError: one cannot be read.
     """
     files = list(paths)
-    with ThreadPoolExecutor() as pool:
+    with ThreadPoolExecutor(cores()) as pool:
         found = pool.map(partial(_hash, read=_all), files)
         return dict(zip((_name(root, path) for path in files), found, strict=True))
 

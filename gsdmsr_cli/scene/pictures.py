@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import math
-import os
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from hashlib import blake2b
@@ -15,6 +14,7 @@ import torch
 from torch import Tensor
 
 from gsdmsr_cli.ground.errors import UsageError
+from gsdmsr_cli.ground.limits import cores
 from gsdmsr_cli.ground.progress import OnProgress
 from gsdmsr_cli.scene.block_store import BlockStore
 from gsdmsr_cli.scene.camera import Camera
@@ -112,7 +112,7 @@ class Pictures:
         views = list(views)
         sizes = [3 * width * height for width, height in map(self._size, views)]
         views = views[: self.store.fitting(sizes)]
-        with ThreadPoolExecutor(min(8, os.cpu_count() or 1)) as pool:
+        with ThreadPoolExecutor(min(8, cores())) as pool:
             for done, _ in enumerate(pool.map(self.load, views), start=1):
                 if progress is not None:
                     progress(done, len(views))

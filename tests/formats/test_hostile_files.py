@@ -239,3 +239,11 @@ def test_names_of_views_do_not_steer_a_terminal(tmp_path: Path) -> None:
     frame = {"file_path": f"images/{name}.png", "time": 0, "transform_matrix": pose()}
     write_json(folder / "transforms.json", {"camera_angle_x": 0.7, "frames": [frame]})
     assert read_scene(folder).views[0].name == r"a\x1b[31m\u202eb"
+
+
+def test_a_list_in_place_of_a_name_is_refused(tmp_path: Path) -> None:
+    """Found by fuzzing: it is among the names, and cannot be looked up."""
+    frame = {"file_path": ["a.png"], "transform_matrix": pose()}
+    document = {"camera_angle_x": 0.7, "frames": [frame], "train_filenames": [["a.png"]]}
+    write_json(tmp_path / "transforms.json", document)
+    assert_refused(tmp_path, "is the file_path of no frame")
