@@ -71,9 +71,7 @@ def train(
     """Reconstruct a moving scene from its pictures."""
     if budget is not None and steps is not None:
         raise UsageError("--budget and --steps are both given; drop one")
-    if resume and overwrite:
-        raise UsageError("--resume and --overwrite are both given; drop one")
-    from gsdmsr_cli.commands import train as command
+    from gsdmsr_cli.training.request import Request
 
     options = {
         "training.budget": budget,
@@ -84,9 +82,12 @@ def train(
         "training.threads": threads,
         "training.keep": keep,
     }
-    overrides = [*(set_ or []), *_overrides(options)]
-    given = preset, config, overrides, device, resume, overwrite, dry_run, verify_data
-    command.run(data, out, *given, tensorboard, wandb)
+    overrides = *(set_ or ()), *_overrides(options)
+    named = data, out, preset, config, overrides, device
+    request = Request(*named, resume, overwrite, dry_run, verify_data, tensorboard, wandb)
+    from gsdmsr_cli.commands import train as command
+
+    command.run(request)
 
 
 def _overrides(options: dict[str, str | int | None]) -> list[str]:

@@ -10,10 +10,11 @@ from gsdmsr_cli.commands import render, train
 from gsdmsr_cli.commands._progress import progress_bar
 from gsdmsr_cli.demo.synthetic import write_scene
 from gsdmsr_cli.evaluation.request import Output
-from gsdmsr_cli.filming.request import Request
+from gsdmsr_cli.filming.request import Request as FilmRequest
 from gsdmsr_cli.ground import say
 from gsdmsr_cli.ground.errors import DataError, UsageError
 from gsdmsr_cli.ground.locks import sole_writer
+from gsdmsr_cli.training.request import Request
 
 BUDGET = "60s"
 """Wall time of the training; with everything else the demo stays under 3 minutes on 2 cores."""
@@ -33,10 +34,10 @@ def run(out: Path) -> None:
     scene, run_folder = out / "scene", out / "run"
     with sole_writer(out), say.parts() as answers:
         _write_scene(scene)
-        overrides = [f"training.budget={BUDGET}"]
-        train.run(scene, run_folder, "dnerf", None, overrides, "auto", False, run_folder.exists())
+        named = scene, run_folder, "dnerf", None, (f"training.budget={BUDGET}",)
+        train.run(Request(*named, overwrite=run_folder.exists()))
         evaluate.run(run_folder, None, None, Output(report=True))
-        render.run(run_folder, Request(), None)
+        render.run(run_folder, FilmRequest(), None)
     parts = dict(zip(("train", "eval", "render"), answers, strict=False))
     places = _places(scene, run_folder)
     say.result({"places": places, **parts}, _where_to_look(places, run_folder))

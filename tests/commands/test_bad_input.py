@@ -9,6 +9,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ import torch
 from datasets import noise, write_picture
 
 from gsdmsr_cli.cli.main import main
+from gsdmsr_cli.commands import _beginning
 from gsdmsr_cli.commands import train as train_command
 from gsdmsr_cli.commands._trained import open_trained
 from gsdmsr_cli.drawing.splatting import draw
@@ -94,7 +96,10 @@ USAGE = {
     ),
     "no steps": ("--steps 0", "steps is 0; allowed: 1 or more"),
     "downscale of nothing": ("--downscale 0", "downscale is 0; allowed: 1 or more"),
-    "downscale beyond the picture": ("--downscale 49", "48 x 48 px.*allowed: 1 to 48"),
+    "downscale beyond the picture": (
+        "--preset dnerf --downscale 49",
+        "48 x 48 px.*allowed: 1 to 48",
+    ),
 }
 
 
@@ -124,7 +129,8 @@ def test_sizes_that_no_kernel_serves_are_refused_before_the_data_is_looked_for(
     gsdmsr: Gsdmsr, tmp_path: Path, capsys: Any, option: str, message: str
 ) -> None:
     nowhere, out = tmp_path / "nowhere", tmp_path / "run"
-    assert gsdmsr("train", "--data", nowhere, "--out", out, "--set", option) == 2
+    options = "--preset", "dnerf", "--set", option
+    assert gsdmsr("train", "--data", nowhere, "--out", out, *options) == 2
     assert one_line(capsys).endswith(f": {message}\n")
     assert not out.exists()
 
@@ -214,8 +220,8 @@ def test_a_training_holds_its_folder_from_the_first_look_to_the_last_word(
 ) -> None:
     asked: list[str] = []
 
-    def ask(moment: str) -> None:
-        real = getattr(train_command, moment)
+    def ask(moment: str, module: ModuleType = train_command) -> None:
+        real = getattr(module, moment)
 
         def asking(*given: Any) -> Any:
             asked.append(moment)
@@ -223,10 +229,11 @@ def test_a_training_holds_its_folder_from_the_first_look_to_the_last_word(
                 pass
             return real(*given)
 
-        monkeypatch.setattr(train_command, moment, asking)
+        monkeypatch.setattr(module, moment, asking)
 
     first = "open_run" if how == "--resume" else "refuse_used"
-    for moment in (first, "read_scene", "write_json"):
+    ask(first, _beginning)
+    for moment in ("read_scene", "write_json"):
         ask(moment)
     few = [part for option in FEW for part in ("--set", option)]
     options = [*few, "--steps", 1, "--set", "training.threads=1", how]

@@ -24,7 +24,7 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> Calls:
     def record(name: str, *arguments: Any) -> None:
         calls.append((name, arguments))
         if name == "train":
-            arguments[1].mkdir(exist_ok=True)
+            arguments[0].out.mkdir(exist_ok=True)
         if name == "render":
             (arguments[0] / "orbit.webm").touch()
 
@@ -45,10 +45,11 @@ def test_it_makes_trains_evaluates_renders_and_tells(
     demo.run(out)
     assert len(dnerf.read(out / "scene").views) == 4
     assert [name for name, _ in calls] == ["train", "eval", "render"]
-    data, run_folder, preset, config, overrides, device, resume, overwrite = calls[0][1]
-    assert (data, run_folder, device) == (out / "scene", out / "run", "auto")
-    assert (resume, overwrite) == (False, False)
-    budget = load_preset(preset, config, overrides).training.budget
+    (asked,) = calls[0][1]
+    run_folder = out / "run"
+    assert (asked.data, asked.out, asked.device) == (out / "scene", run_folder, "auto")
+    assert not (asked.resume or asked.overwrite or asked.dry_run)
+    budget = load_preset(asked.preset, asked.config, asked.overrides).training.budget
     assert budget is not None
     assert parse_duration(budget) <= 90
     assert calls[1][1][0] == run_folder and calls[1][1][-1].report
@@ -60,7 +61,7 @@ def test_it_makes_trains_evaluates_renders_and_tells(
 def test_an_earlier_demo_is_made_anew(tmp_path: Path, calls: Calls) -> None:
     demo.run(tmp_path)
     demo.run(tmp_path)
-    assert [arguments[-1] for name, arguments in calls if name == "train"] == [False, True]
+    assert [given[0].overwrite for name, given in calls if name == "train"] == [False, True]
 
 
 def test_a_folder_with_something_else_is_refused_and_left(tmp_path: Path, calls: Calls) -> None:

@@ -1,0 +1,169 @@
+"""How a training begins: anew, in a run folder of its own, or where an earlier one has stopped."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from contextlib import ExitStack
+from typing import Any
+
+from gsdmsr_cli.commands._choice import Choice
+from gsdmsr_cli.commands._results import remove_results
+from gsdmsr_cli.ground import say
+from gsdmsr_cli.ground.errors import UsageError
+from gsdmsr_cli.ground.locks import sole_writer
+from gsdmsr_cli.options import strict
+from gsdmsr_cli.options.preset import Preset, load_preset
+from gsdmsr_cli.runs.run import OUTPUTS, Run, continue_run, create_run, open_run, refuse_used
+from gsdmsr_cli.runs.seen_pictures import check_whole
+from gsdmsr_cli.scene.scene import Scene
+from gsdmsr_cli.training.request import Request
+from gsdmsr_cli.training.schedule import new_clock
+from gsdmsr_cli.training.trainer import Trainer
+
+MAY_CHANGE = (
+    "training.budget", "training.steps", "training.threads", "training.checkpoint_minutes",
+    "training.keep", "data.cache_mib",
+)  # fmt: skip
+"""Options that a resumed training may have otherwise: its length, and what changes no result."""
+
+
+class Anew:
+    """A new training.
+
+    Attributes:
+        options: all of them, as far as they are known before the scene is.
+        name: of the preset, or of the file of options, for reports.
+        reason: which preset follows from the data, and why; None where it was named.
+
+    Args:
+        request: the command line's.
+        held: where locks go that last until the training's end.
+
+    Raises:
+        UsageError: an option does not exist or is out of range.
+        DataError: the run folder is in use.
+    """
+
+    def __init__(self, request: Request, held: ExitStack) -> None:
+        self._request = request
+        self._choice = Choice(request.preset, request.config, request.overrides)
+        self.options = self._choice.check()  # an error now rather than after the data is read
+        self.name = ""
+        self.reason: str | None = None
+        refuse_used(request.out, request.overwrite)
+        for name in OUTPUTS:
+            if (request.out / name).is_dir():  # goes with the run, but not from under a writer
+                held.enter_context(sole_writer(request.out / name))
+
+    def suit(self, scene: Scene) -> None:
+        """Complete the options by the preset that suits the scene.
+
+        Raises:
+            UsageError: an option does not exist or is out of range.
+        """
+        chosen = self._choice.suit(scene)
+        self.options, self.name, self.reason = chosen.options, chosen.name, chosen.reason
+        if self.reason is not None:
+            say.note(f"{self.reason}; --preset names another")
+
+    def restore(self, trainer: Trainer) -> None:
+        """Leave the training as it is: at its first step."""
+
+    def open_folder(self, trainer: Trainer) -> Run:
+        """Return the run folder, made, with a first checkpoint.
+
+        Raises:
+            DataError: it cannot be written; a full disk is an error now, not at the end.
+        """
+        request, scene = self._request, trainer.scene
+        if request.overwrite:
+            remove_results(request.out)
+        about = self.name, self.options, trainer.facts, scene
+        folder = create_run(request.out, *about, request.overwrite, self.reason, request.verify)
+        folder.save(trainer.checkpoint())
+        return folder
+
+
+class Resumed:
+    """A training that goes on from the last checkpoint of its run.
+
+    Attributes, args and errors as those of ``Anew``; a DataError also says that there is no
+    checkpoint which is whole, a UsageError that the training is complete.
+    """
+
+    def __init__(self, request: Request, held: ExitStack) -> None:
+        self._request = request
+        self._earlier = open_run(request.out)
+        self.options = _resumed_options(self._earlier, request)
+        self.name, self.reason = self._earlier.name, self._earlier.reason
+        self._checkpoint, damage = self._earlier.load_whole()
+        if damage:
+            say.warn(f"warning: {damage}")
+        self._require_rest()
+
+    def _require_rest(self) -> None:
+        clock = new_clock(self.options.training)
+        clock.step, clock.before = self._checkpoint.step, self._checkpoint.elapsed
+        if clock.progress >= 1:
+            raise UsageError(
+                f"{self._earlier.root}: is complete at step {clock.step} after "
+                f"{clock.elapsed:.0f} s; give it a longer --budget or more --steps"
+            )
+
+    def suit(self, scene: Scene) -> None:
+        """Raise DataError unless the scene is that of the run."""
+        self._earlier.check_scene(scene)
+        if self._request.verify:
+            check_whole(self._earlier.root, scene)
+
+    def restore(self, trainer: Trainer) -> None:
+        """Take the training to where the checkpoint was made."""
+        trainer.restore(self._checkpoint)
+
+    def open_folder(self, trainer: Trainer) -> Run:
+        """Return the run folder, with the present options and a log up to the checkpoint.
+
+        Raises:
+            DataError: it cannot be written.
+        """
+        folder = continue_run(self._earlier, self.options, trainer.scene)
+        folder.rewind_log(trainer.clock.step)
+        return folder
+
+
+Beginning = Anew | Resumed
+
+
+def _resumed_options(earlier: Run, request: Request) -> Preset:
+    """Return the run's own options, with another length where the command line asks for one.
+
+    Raises:
+        UsageError: the command line asks for anything else.
+    """
+    stored = strict.dump(earlier.preset)
+    if request.preset is None and request.config is None:
+        own = [f"{topic}={json.dumps(value)}" for topic, value in stored.items()]
+        asked = load_preset(None, None, [*own, *request.overrides])
+    else:
+        asked = load_preset(request.preset, request.config, request.overrides)
+    earlier_values, values = _by_option(stored), _by_option(strict.dump(asked))
+    for name in earlier_values | values:
+        was, now = earlier_values.get(name), values.get(name)
+        if was != now and name not in MAY_CHANGE:
+            raise UsageError(
+                f"{earlier.root}: was trained with {name} = {json.dumps(was)}, not "
+                f"{json.dumps(now)}; --resume may change only the length of a training"
+            )
+    return asked
+
+
+def _by_option(dumped: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the values of a dumped preset as "topic.key", and lists as "topic"."""
+    values: dict[str, Any] = {}
+    for topic, value in dumped.items():
+        if isinstance(value, dict):
+            values |= {f"{topic}.{key}": own for key, own in value.items()}
+        else:
+            values[topic] = value
+    return values
