@@ -36,6 +36,7 @@ CONSTANTS = {"gsdmsr_cli.ground.splatting_constants", "gsdmsr_cli.ground.ssim"}
 
 FOR_KERNELS = CONSTANTS | {
     "gsdmsr_cli.backends.cpu",
+    "gsdmsr_cli.backends.kernel_folder",
     "gsdmsr_cli.ground",
     "gsdmsr_cli.ground.machine",
 }

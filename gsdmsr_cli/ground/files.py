@@ -171,6 +171,18 @@ def require_folder(path: Path) -> None:
         raise DataError(f"{path}: cannot be written; choose another folder or change its rights")
 
 
+def can_be_written(folder: Path) -> bool:
+    """Return whether the folder, or the nearest one above it that is there, takes files."""
+    place = nearest_there(folder)
+    return place.is_dir() and os.access(place, os.W_OK | os.X_OK)
+
+
+def nearest_there(path: Path) -> Path:
+    """Return the path, or the nearest one above it that is there, absolute."""
+    whole = path.absolute()
+    return next(place for place in (whole, *whole.parents) if os.access(place, os.F_OK))
+
+
 def read_json(path: Path) -> dict[str, Any]:
     """Return the object that ``path`` holds.
 

@@ -15,8 +15,16 @@ _PACKAGES = ("torch", "numba", "numpy")
 
 
 def cache_home() -> Path:
-    """Return the folder for what can be made again, such as compiled kernels."""
-    return Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "gsdmsr"
+    """Return the folder for what can be made again, such as compiled kernels.
+
+    Whoever has no home, as a user of a container without a name, gets a path that cannot be made.
+    """
+    named = Path(os.environ.get("XDG_CACHE_HOME", ""))
+    try:
+        place = named if named.is_absolute() else Path.home() / ".cache"
+    except RuntimeError:
+        place = Path(os.devnull).absolute()
+    return place / "gsdmsr"
 
 
 def cpu_name() -> str:

@@ -13,7 +13,6 @@ earlier one. The folder can be moved; nothing in it is pickled.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
@@ -25,7 +24,13 @@ from safetensors import SafetensorError
 
 from gsdmsr_cli import __version__
 from gsdmsr_cli.ground.errors import DataError, GsdmsrError, UsageError
-from gsdmsr_cli.ground.files import read_json, remove_leftovers, write_json
+from gsdmsr_cli.ground.files import (
+    can_be_written,
+    nearest_there,
+    read_json,
+    remove_leftovers,
+    write_json,
+)
 from gsdmsr_cli.model.building import load_model
 from gsdmsr_cli.model.layer import Facts
 from gsdmsr_cli.model.model import Model
@@ -345,7 +350,7 @@ def _clear(root: Path) -> None:
 
 def _require_place(root: Path) -> None:
     """Raise DataError unless the folder ``root``, which is not there yet, can be made."""
-    nearest = next(parent for parent in root.absolute().parents if parent.exists())
-    if not nearest.is_dir() or not os.access(nearest, os.W_OK):
+    nearest = nearest_there(root)
+    if not can_be_written(root):
         problem = "cannot be written" if nearest.is_dir() else "is a file"
         raise DataError(f"{root}: cannot be made, since {nearest} {problem}; choose another --out")

@@ -15,13 +15,14 @@ import os
 import pickle
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from importlib import metadata
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 from gsdmsr_cli.backends.cpu.forking import Forks
+from gsdmsr_cli.backends.kernel_folder import choose_folder
 from gsdmsr_cli.ground.machine import cache_home
 
 try:
@@ -49,20 +50,15 @@ def _sources_hash() -> str:
 
 
 def _cache_folder() -> Path:
-    """Folder of compiled kernels: beside the sources if that is writable, else the user's cache.
+    """Folder of compiled kernels: what the user names, beside the sources, or the user's cache.
 
     Numba alone would not recompile a kernel when a helper in another module changes, so the
     folder's name is a hash of all kernel sources and of the constants compiled into them.
     """
-    beside = HERE / "__pycache__"
-    try:
-        beside.mkdir(exist_ok=True)
-        writable = os.access(beside, os.W_OK)
-    except OSError:
-        writable = False
-    if writable:
-        return beside / _sources_hash()
-    return cache_home() / _sources_hash()
+    if named := os.environ.get("NUMBA_CACHE_DIR"):
+        return choose_folder([Path(named)])
+    name = _sources_hash()
+    return choose_folder([HERE / "__pycache__" / name, cache_home() / name])
 
 
 def _keep_large_blocks_in_the_heap() -> None:
@@ -118,7 +114,7 @@ _keep_tbb_loaded()
 
 # set in both places: Numba has read its environment already if anybody imported it before, and
 # reads it again when it changes
-numba.config.CACHE_DIR = os.environ.setdefault("NUMBA_CACHE_DIR", str(_cache_folder()))
+numba.config.CACHE_DIR = os.environ["NUMBA_CACHE_DIR"] = str(_cache_folder())
 
 FLAGS = {"reassoc", "contract", "arcp", "nsz", "afn"}
 """Floating-point liberties of all kernels. Not nnan and ninf: kernels test for non-finite input."""
@@ -154,6 +150,11 @@ class _Cache(FunctionCache):  # type: ignore[misc]
                 found = super().load_overload(signature, target)
         return found
 
+    def save_overload(self, signature: Any, data: Any) -> None:
+        """Keep a compiled kernel; where the disk is full, the next process compiles it again."""
+        with suppress(OSError):
+            super().save_overload(signature, data)
+
     def _kernel(self) -> tuple[str, str]:
         return self._py_func.__module__, self._py_func.__qualname__
 
@@ -166,10 +167,13 @@ class _Cache(FunctionCache):  # type: ignore[misc]
     def _locked(self) -> Iterator[None]:
         """Let one process at a time add to the kernel's index, which Numba reads and writes."""
         folder = Path(self.cache_path)
-        folder.mkdir(parents=True, exist_ok=True)
-        with (folder / f"{self._impl.filename_base}.lock").open("w") as file:
-            if fcntl is not None:
-                fcntl.flock(file, fcntl.LOCK_EX)
+        with ExitStack() as held:
+            with suppress(OSError):  # as where the disk is full, and nothing is added
+                folder.mkdir(parents=True, exist_ok=True)
+                path = folder / f"{self._impl.filename_base}.lock"
+                file = held.enter_context(path.open("w"))
+                if fcntl is not None:
+                    fcntl.flock(file, fcntl.LOCK_EX)
             yield
 
 

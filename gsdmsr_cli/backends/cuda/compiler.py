@@ -10,7 +10,7 @@ from pathlib import Path
 
 from gsdmsr_cli.backends.cuda.nvrtc import Nvrtc
 from gsdmsr_cli.ground import splatting_constants as constants
-from gsdmsr_cli.ground.errors import GsdmsrError
+from gsdmsr_cli.ground.errors import DataError, GsdmsrError
 from gsdmsr_cli.ground.files import replacing
 from gsdmsr_cli.ground.machine import cache_home
 
@@ -92,7 +92,7 @@ def compiled(nvrtc: Nvrtc, source: str, capability: int) -> bytes:
     if path.is_file():
         return path.read_bytes()
     program = translate(nvrtc, source, architecture, form)[0]
-    with contextlib.suppress(OSError):  # a cache that cannot be written costs time, nothing else
+    with contextlib.suppress(OSError, DataError):  # what cannot be kept costs time, nothing else
         path.parent.mkdir(parents=True, exist_ok=True)
         with replacing(path) as beside:
             beside.write_bytes(program)

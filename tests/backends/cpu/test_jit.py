@@ -73,6 +73,27 @@ def test_a_process_compiles_what_no_other_can(tmp_path: Path) -> None:
     assert compiled_in(tmp_path) == [[1, 0], [0, 0]]
 
 
+def test_a_folder_that_cannot_be_written_costs_time_and_a_warning(tmp_path: Path) -> None:
+    """The process compiles into a temporary folder, which ends with it."""
+    named = dict(os.environ, NUMBA_CACHE_DIR="/dev/null/nowhere", TMPDIR=str(tmp_path))
+    command = [sys.executable, "-c", IN_A_NEW_PROCESS]
+    done = subprocess.run(command, env=named, check=True, capture_output=True, text=True)
+    assert json.loads(done.stdout) == [[1, 0], [0, 0]]
+    assert done.stderr.count("\n") == 1 and not list(tmp_path.iterdir())
+    assert done.stderr.startswith("warning: compiled kernels cannot be kept in /dev/null/nowhere")
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="files cannot be bounded there")
+def test_a_full_disk_costs_time_alone(tmp_path: Path) -> None:
+    full = """
+import resource, signal
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+resource.setrlimit(resource.RLIMIT_FSIZE, (0, 0))
+"""
+    assert compiled_in(tmp_path, full + IN_A_NEW_PROCESS) == [[0, 1], [0, 1]]
+    assert not list(tmp_path.rglob("*.nb?"))
+
+
 ON_ONE_CORE = """
 import os
 os.sched_setaffinity(0, [min(os.sched_getaffinity(0))])

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
 import cuda_shim
 import pytest
@@ -82,6 +84,17 @@ def test_a_cache_that_cannot_be_written_does_no_harm(
     compiler._cache_folder.cache_clear()
     assert compiler.compiled(nvrtc, "binning", 90).startswith(b"\x7fELF")
     compiler._cache_folder.cache_clear()
+
+
+def test_a_full_disk_does_no_harm(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(path: Path, content: bytes) -> None:
+        raise OSError(28, "No space left on device", str(path))
+
+    found = SimpleNamespace(version=(12, 9), architectures=lambda: [90])
+    monkeypatch.setattr(compiler, "translate", lambda *_: (b"a program", ""))
+    monkeypatch.setattr(Path, "write_bytes", refuse)
+    assert compiler.compiled(cast(Nvrtc, found), "binning", 90) == b"a program"
+    assert not [path for path in cache.rglob("*") if path.is_file()]
 
 
 def test_cards_newer_than_the_compiler_get_what_their_driver_can_compile(
