@@ -43,7 +43,7 @@ def video_found(path: Path) -> Found:
         "frames": len(times),
         "size": list(min(sizes, default=())),
         "seconds": round(lasts, 3),
-        "frames a second": rate,
+        "frames_a_second": rate,
         "bytes": path.stat().st_size,
     }
     return Found("video", facts, tuple(problems))

@@ -32,7 +32,7 @@ def _described(run: Run) -> dict[str, Any]:
     training = run.preset.training
     return {
         "preset": run.name,
-        "preset since": run.reason,
+        "preset_reason": run.reason,
         "motion": run.preset.motion["name"],
         "length": training.budget or f"{training.steps} steps",
         "seed": training.seed,
@@ -68,4 +68,4 @@ def _data(run: Run) -> dict[str, Any]:
     there = run.data.is_dir()
     if there and not needs_preparing(run.data):
         run.check_scene(read_scene(run.data))
-    return {"data": str(run.data), "layout": run.layout, "data is there": there}
+    return {"data": str(run.data), "layout": run.layout, "data_is_there": there}

@@ -31,7 +31,7 @@ def facts_of(scene: Scene) -> dict[str, Any]:
     suited = suited_preset(scene)
     signals = sorted({name for view in scene.views for name in view.signals})
     return {
-        "made from": scene.origin,
+        "made_from": scene.origin,
         "pictures": counts,
         "size": [camera.width, camera.height],
         "lens": "with distortion" if any(view.lens for view in scene.views) else "pinhole",
@@ -43,6 +43,6 @@ def facts_of(scene: Scene) -> dict[str, Any]:
         "radius": scene.radius,
         "points": len(scene.points),
         "preset": suited.name,
-        "preset since": suited.reason,
+        "preset_reason": suited.reason,
         "fingerprint": scene.fingerprint,
     }

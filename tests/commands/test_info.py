@@ -104,13 +104,13 @@ def run(tiny_scene: Path, tmp_path: Path) -> Run:
 
 def test_a_run(run: Run, capsys: Capture) -> None:
     found = answer(run.root, capsys)
-    assert (found["kind"], found["preset"], found["preset since"]) == ("run", "dnerf", "why")
+    assert (found["kind"], found["preset"], found["preset_reason"]) == ("run", "dnerf", "why")
     assert (found["motion"], found["step"], found["complete"]) == ("control_points", 0, False)
     assert found["splats"] == 60 and found["val_psnr"] == 12.5
     assert found["checkpoint_bytes"] == run.checkpoint_path.stat().st_size
-    assert found["data is there"] is True and found["layout"] == "dnerf"
+    assert found["data_is_there"] is True and found["layout"] == "dnerf"
     shutil.move(run.data, run.data.with_name("elsewhere"))
-    assert answer(run.root, capsys)["data is there"] is False  # `--data` says where it is
+    assert answer(run.root, capsys)["data_is_there"] is False  # `--data` says where it is
 
 
 def test_a_run_with_other_data_and_a_damaged_checkpoint(run: Run, capsys: Capture) -> None:
@@ -126,7 +126,7 @@ def test_a_video_and_one_cut_short(tmp_path: Path, capsys: Capture) -> None:
     path = encode(tmp_path / "a.mp4", 10)
     found = answer(path, capsys)
     assert (found["kind"], found["frames"], found["size"]) == ("video", 10, [64, 48])
-    assert found["frames a second"] == 25 and found["bytes"] == path.stat().st_size
+    assert found["frames_a_second"] == 25 and found["bytes"] == path.stat().st_size
     path.write_bytes(path.read_bytes()[:300])
     assert "no video stream" in problems(path, capsys)[0]
 
