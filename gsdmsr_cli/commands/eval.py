@@ -59,7 +59,7 @@ def run(
             gates.baseline.require_same(protocol)
         held.enter_context(sole_writer(folder))
         if output.junit:
-            require_folder(output.junit.parent)
+            require_folder(output.junit.parent, "choose another --junit or change the rights")
         document = measure(trained, request)
         verdicts = gates.judge(document)
         write_json(folder / METRICS, document)

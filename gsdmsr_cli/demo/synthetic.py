@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsdmsr_cli.demo.solids import Ball, Box, Capsule, Disc, Floats, Solid, column, dot
+from gsdmsr_cli.ground.files import write_text
 from gsdmsr_cli.ground.limits import cores
 from gsdmsr_cli.ground.progress import OnProgress
 from gsdmsr_cli.scene.camera import Camera, look_at
@@ -191,8 +192,8 @@ def write_scene(
     pictures. The transforms are written last: a folder that has them is complete.
 
     Raises:
-        DataError: a picture cannot be written.
-        OSError: a folder or the transforms cannot be written.
+        DataError: a picture or the transforms cannot be written.
+        OSError: a folder cannot be made.
     """
     generator = np.random.default_rng(seed)
     splits = {
@@ -204,8 +205,7 @@ def write_scene(
         (folder / split).mkdir(parents=True, exist_ok=True)
     _draw_all(folder, [shot for shots in splits.values() for shot in shots], progress)
     for split, shots in splits.items():
-        path = folder / f"transforms_{split}.json"
-        path.write_text(json.dumps(_transforms(shots), indent=1), encoding="utf-8")
+        write_text(folder / f"transforms_{split}.json", json.dumps(_transforms(shots), indent=1))
 
 
 def _scattered(count: int, size: int, generator: np.random.Generator) -> list[Camera]:

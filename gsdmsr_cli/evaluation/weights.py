@@ -72,7 +72,7 @@ def fetch(wanted: Source, folder: Path, on_progress: OnProgress) -> Fetched:
     Raises:
         DataError: it cannot be reached, is not what it should be, or cannot be written.
     """
-    require_folder(folder)
+    require_folder(folder, "choose another --to or change the rights")
     path, digest, size = folder / wanted.name, hashlib.sha256(), 0
     with replacing(path) as beside, beside.open("wb") as file:
         for chunk in _download(wanted.url, on_progress):

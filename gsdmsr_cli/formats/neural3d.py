@@ -35,6 +35,12 @@ HALVED_FROM = 2000
 FRAME_RATE = 30.0
 """Of all videos of the data set [1 / s]."""
 
+_ELSEWHERE = (
+    "frames are decoded there, once; copy the data to a folder that can be written, or change the "
+    "rights"
+)
+"""What to do where the frames of videos cannot be written."""
+
 _PART = ".part"
 _STALE = re.compile(rf"\.images\.[0-9a-f]{{32}}{re.escape(_PART)}")
 """What a killed process leaves of a video that it was decoding."""
@@ -130,7 +136,7 @@ def _decode(video: Path, target: Path, count: Callable[[], None]) -> None:
 
     Of several processes one decodes, and the others wait for what it has decoded.
     """
-    with in_turn(target.parent):
+    with in_turn(target.parent, _ELSEWHERE):
         if target.is_dir():
             return
         beside = target.with_name(f".{target.name}.{uuid.uuid4().hex}{_PART}")

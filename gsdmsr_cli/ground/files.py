@@ -23,6 +23,9 @@ _OURS = re.compile(r"\.gsdmsr-([0-9a-f]{16})[0-9a-f]{16}\.part(\.[^/]*)?")
 _REFUSALS = errno.EINVAL, errno.ENOTSUP, errno.EACCES, errno.EPERM
 """What drives answer that cannot flush a folder, or whose folders cannot be read."""
 
+ANOTHER_OUT = "choose another --out or change the rights"
+"""What to do where a folder of results cannot be written."""
+
 
 @contextmanager
 def replacing(path: Path, durable: bool = True) -> Iterator[Path]:
@@ -157,8 +160,12 @@ def write_text(path: Path, text: str) -> None:
         beside.write_text(text, encoding="utf-8")
 
 
-def require_folder(path: Path) -> None:
+def require_folder(path: Path, remedy: str = ANOTHER_OUT) -> None:
     """Make the folder ``path`` unless it is there, so that work for it is not done in vain.
+
+    Args:
+        path: the folder.
+        remedy: what to do where it cannot be written.
 
     Raises:
         DataError: it cannot be made, or nothing can be written there.
@@ -166,9 +173,10 @@ def require_folder(path: Path) -> None:
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise DataError(f"{path}: cannot be made: {error.strerror or error}") from error
+        reason = error.strerror or error
+        raise DataError(f"{path}: cannot be made: {reason}; {remedy}") from error
     if not os.access(path, os.W_OK | os.X_OK):
-        raise DataError(f"{path}: cannot be written; choose another folder or change its rights")
+        raise DataError(f"{path}: cannot be written; {remedy}")
 
 
 def can_be_written(folder: Path) -> bool:

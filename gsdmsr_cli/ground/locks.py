@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from gsdmsr_cli.ground.errors import DataError
-from gsdmsr_cli.ground.files import require_folder
+from gsdmsr_cli.ground.files import ANOTHER_OUT, require_folder
 
 if sys.platform != "win32":
     import fcntl
@@ -52,12 +52,17 @@ def one_of_readers(folder: Path) -> Iterator[None]:
 
 
 @contextmanager
-def in_turn(folder: Path) -> Iterator[None]:
+def in_turn(folder: Path, remedy: str = ANOTHER_OUT) -> Iterator[None]:
     """Wait until no other process is here with the folder ``folder``, which is made.
+
+    Args:
+        folder: the folder.
+        remedy: what to do where it cannot be made.
 
     Raises:
         DataError: the folder cannot be made.
     """
+    require_folder(folder, remedy)
     with _holding(folder, _ALONE, make=True):
         yield
 

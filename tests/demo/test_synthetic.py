@@ -4,19 +4,24 @@ from __future__ import annotations
 
 import json
 import math
+import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+from full_disk import full_at_every_change, has_failed
 from numpy.typing import NDArray
 
 from gsdmsr_cli.demo import synthetic
 from gsdmsr_cli.demo.solids import Ball, Disc
 from gsdmsr_cli.demo.synthetic import CAMERA_ANGLE_X, Placed, camera_on_dome, draw, write_scene
 from gsdmsr_cli.formats import dnerf
+from gsdmsr_cli.ground.errors import DataError
 from gsdmsr_cli.scene.imaging import read_image
 
 SIZE = 48
+
+FEW = {"size": 8, "train": 2, "val": 1, "test": 1}
 
 
 @pytest.fixture(scope="module")
@@ -192,3 +197,29 @@ def test_the_solids_move_as_told(time: float) -> None:
     rod = 0.95 * np.array([-math.sin(swing), 0.0, -math.cos(swing)])
     np.testing.assert_allclose(pendulum.position, pivot + rod, atol=1e-12)
     np.testing.assert_allclose(pendulum.rotation @ [0, 0, -0.95], rod, atol=1e-12)
+
+
+def test_a_disk_that_is_full_at_any_change_is_told(tmp_path: Path) -> None:
+    for folder, full in full_at_every_change(tmp_path, 10, 2):
+        with full:
+            try:
+                write_scene(folder, **FEW)
+            except (DataError, OSError) as error:
+                assert "No space left on device" in str(error)
+        if has_failed():
+            write_scene(folder, **FEW)
+        assert len(dnerf.read(folder).views) == 4
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="files cannot be bounded there")
+def test_transforms_that_do_not_fit_on_the_disk_are_not_there(tmp_path: Path) -> None:
+    import resource
+
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (700, before[1]))  # more than a picture has [bytes]
+    try:
+        with pytest.raises(DataError, match="File too large"):
+            write_scene(tmp_path, **FEW)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert len(list(tmp_path.rglob("*.png"))) == 4 and not list(tmp_path.glob("*.*"))

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from datasets import noise, write_picture
+from full_disk import full_at_every_change, has_failed
 from refusals import assert_refused
 
 from gsdmsr_cli.formats import neural3d, read_scene
@@ -114,6 +115,36 @@ def test_an_interrupted_decoding_leaves_nothing_that_looks_finished(
     monkeypatch.setattr(neural3d, "write_png", write)
     assert len(read_scene(folder).views) == CAMERAS * FRAMES
     assert not stale.exists()
+
+
+def test_a_disk_that_is_full_at_any_change_leaves_nothing_that_looks_finished(
+    tmp_path: Path,
+) -> None:
+    for folder, full in full_at_every_change(tmp_path / "scenes", 8, 2):
+        for i in range(2):
+            encode(folder / f"cam{i:02d}.mp4", frames=2)
+        np.save(folder / "poses_bounds.npy", [row(i) for i in range(2)])
+        with full:
+            try:
+                read_scene(folder)
+            except DataError as error:
+                assert "No space left on device" in str(error)
+        assert all(len(list(frames.iterdir())) == 2 for frames in folder.glob("cam*/images"))
+        assert not [path for path in folder.rglob("*") if ".part" in path.name]
+        if has_failed():
+            assert len(read_scene(folder).views) == 4
+
+
+def test_a_folder_that_cannot_be_written_is_refused_with_what_to_do(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(path: Path, **_: Any) -> None:
+        raise OSError(30, "Read-only file system", str(path))
+
+    monkeypatch.setattr(Path, "mkdir", refuse)
+    with pytest.raises(DataError, match=r"cam00: cannot be made: Read-only .*; frames are") as e:
+        read_scene(folder)
+    assert "copy the data to a folder that can be written" in str(e.value)
 
 
 def poses(change: Callable[[np.ndarray], Any]) -> Callable[[Path], Any]:
