@@ -102,7 +102,7 @@ def sequence_found(folder: Path, files: list[Path]) -> Found:
     counts = [count for found in each for count in (found.facts.get("splats"),) if count]
     total = sum(path.stat().st_size for path in files)
     splats = [min(counts, default=0), max(counts, default=0)]
-    facts = {"files": len(files), "splats from and to": splats, "bytes": total}
+    facts = {"files": len(files), "splats_from_to": splats, "bytes": total}
     return Found("PLY sequence", facts, tuple(problems[:_SHOWN]))
 
 

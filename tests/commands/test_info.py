@@ -151,7 +151,7 @@ def test_splats_and_a_sequence_of_them(tmp_path: Path, capsys: Capture) -> None:
     assert (found["kind"], found["splats"], found["sh_degree"]) == ("splats", 5, 2)
     found = answer(tmp_path / "s", capsys)
     assert (found["kind"], found["files"]) == ("PLY sequence", 3)
-    assert found["splats from and to"] == [5, 7]
+    assert found["splats_from_to"] == [5, 7]
     (tmp_path / "s" / "frame0002.ply").unlink()
     assert "1 files of the sequence are missing" in problems(tmp_path / "s", capsys)[0]
     path = tmp_path / "s" / "frame0001.ply"
