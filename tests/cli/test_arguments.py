@@ -14,6 +14,7 @@ from gsdmsr_cli.exports import format_names
 from gsdmsr_cli.filming.request import Request
 from gsdmsr_cli.ground.errors import UsageError
 from gsdmsr_cli.options.preset import load_preset
+from gsdmsr_cli.training.request import Request as Training
 
 Gsdmsr = Any  # the fixture of conftest.py
 
@@ -24,25 +25,25 @@ Gsdmsr = Any  # the fixture of conftest.py
         (
             "train --data d --out r",
             "train",
-            (Path("d"), Path("r"), None, None, [], "auto", False, False, False, False, False, None),
+            (Training(Path("d"), Path("r")),),
         ),
         (
             "train --data d --out r --preset dnerf --config f.yaml --set a.b=1 --set a.c=2"
             " --device cpu --resume --verify-data --tensorboard --wandb p",
             "train",
             (
-                Path("d"),
-                Path("r"),
-                "dnerf",
-                Path("f.yaml"),
-                ["a.b=1", "a.c=2"],
-                "cpu",
-                True,
-                False,
-                False,
-                True,
-                True,
-                "p",
+                Training(
+                    Path("d"),
+                    Path("r"),
+                    "dnerf",
+                    Path("f.yaml"),
+                    ("a.b=1", "a.c=2"),
+                    "cpu",
+                    resume=True,
+                    verify=True,
+                    tensorboard=True,
+                    wandb="p",
+                ),
             ),
         ),
         ("eval r", "eval", (Path("r"), Evaluation(), Demands(), Output(), None)),
@@ -195,11 +196,11 @@ def test_every_exporter_is_offered(gsdmsr: Gsdmsr) -> None:
         assert gsdmsr.calls[-1] == ("export", (Path("r"), name, None, None, [], Path("o")))
 
 
-def overrides_of(gsdmsr: Gsdmsr, options: str) -> list[str]:
+def overrides_of(gsdmsr: Gsdmsr, options: str) -> tuple[str, ...]:
     assert gsdmsr(f"train --data d --out r {options}") == 0
-    overrides = gsdmsr.calls[-1][1][4]
-    assert isinstance(overrides, list)
-    return overrides
+    (request,) = gsdmsr.calls[-1][1]
+    assert isinstance(request, Training)
+    return request.overrides
 
 
 def test_the_convenience_options_of_train_become_overrides(gsdmsr: Gsdmsr) -> None:
