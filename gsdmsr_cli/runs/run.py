@@ -26,6 +26,7 @@ from gsdmsr_cli import __version__
 from gsdmsr_cli.ground.errors import DataError, GsdmsrError, UsageError
 from gsdmsr_cli.ground.files import (
     can_be_written,
+    leftovers,
     nearest_there,
     read_json,
     remove_leftovers,
@@ -224,8 +225,8 @@ def refuse_used(root: Path, overwrite: bool) -> None:
     if not root.exists():
         _require_place(root)
         return
-    if root.is_dir() and not any(root.iterdir()):
-        return
+    if root.is_dir() and set(root.iterdir()) <= {*leftovers(root)}:
+        return  # it is empty but for what a training that was killed at its start has left
     if not is_run(root):
         raise DataError(f"{root}: exists and is not a run folder; choose another --out")
     if not overwrite:

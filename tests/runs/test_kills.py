@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import signal
 import sys
 from collections.abc import Callable
@@ -19,7 +20,7 @@ from gsdmsr_cli.model.layer import Facts
 from gsdmsr_cli.options.preset import load_preset
 from gsdmsr_cli.runs import checkpoints
 from gsdmsr_cli.runs.checkpoints import Checkpoint
-from gsdmsr_cli.runs.run import Run, continue_run, create_run, open_run
+from gsdmsr_cli.runs.run import Run, continue_run, create_run, is_run, open_run
 from gsdmsr_cli.scene.scene import Scene
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="processes cannot be forked here")
@@ -138,6 +139,21 @@ def test_a_save_that_is_killed_at_any_call(run: Run, scene: Scene, keep: int) ->
         lambda: assert_sound(run, {BEFORE, AFTER}, scene),
     )
     assert points >= 10
+
+
+def test_a_beginning_that_is_killed_at_any_call(run: Run, scene: Scene, tmp_path: Path) -> None:
+    """Then the same command begins, unless there is a run to be gone on with already."""
+    root = tmp_path / "new"
+
+    def begin(overwrite: bool = False) -> Run:
+        return create_run(root, "static", run.preset, FACTS, scene, overwrite)
+
+    def check() -> None:
+        begin(overwrite=is_run(root)).save(checkpoint_of(AFTER))
+        assert not [path for path in root.rglob("*") if ".part" in path.name]
+        shutil.rmtree(root)
+
+    assert kill_everywhere(begin, root, check) >= 8
 
 
 def test_a_beginning_anew_that_is_killed_at_any_call(run: Run, scene: Scene) -> None:
