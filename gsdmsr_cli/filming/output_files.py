@@ -106,8 +106,8 @@ class OutputFiles:
             if kept.get("fps") != self.fps:
                 self._remove_videos()
             remove_leftovers(self.folder)
-            for kind in VIDEOS:
-                remove_leftovers(self.target, self.video(kind).name)
+            for path in (self.origin, *map(self.video, VIDEOS)):
+                remove_leftovers(self.target, path.name)
         except OSError as error:
             raise DataError(
                 f"{self.folder}: cannot be written: {error.strerror or error}"

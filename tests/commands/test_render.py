@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import re
@@ -195,6 +196,22 @@ def test_frames_of_another_checkpoint_are_drawn_anew(
     assert render("--path orbit --frames 3") == 0
     assert frames_drawn(capsys) == 3
     opened.checkpoint_path.write_bytes(before)
+
+
+def test_what_a_killed_film_has_left_unfinished_is_removed(render: Render, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    (out / "orbit").mkdir(parents=True)
+    left = [unfinished(out / name) for name in ("orbit.film.json", "orbit.webm", "orbit/0001.png")]
+    assert render("--path orbit --frames 2") == 0
+    assert [path for path in left if path.exists()] == []
+
+
+def unfinished(path: Path) -> Path:
+    """Make what a killed process leaves of a file that it was writing."""
+    name = hashlib.sha256(path.name.encode()).hexdigest()[:16]
+    left = path.with_name(f".gsdmsr-{name}{0:016x}.part{path.suffix}")
+    left.touch()
+    return left
 
 
 def test_a_damaged_frame_is_drawn_again(render: Render, tmp_path: Path, capsys: Any) -> None:
