@@ -94,6 +94,24 @@ def write_exr(path: Path, image: NDArray[np.float32], channels: tuple[str, ...])
         opened = out.open(str(temporary), spec)
         if not (opened and out.write_image(np.ascontiguousarray(image)) and out.close()):
             raise OSError(" ".join(out.geterror().split()) or "unknown reason")
+        _require_last_row(temporary)
+
+
+def _require_last_row(path: Path) -> None:
+    """Raise OSError if the end of a file that was written is not there.
+
+    OpenImageIO does not tell that the last bytes, which wait until the file is closed, are lost.
+    """
+    source = OpenImageIO.ImageInput.open(str(path))
+    if source is None:
+        raise OSError("it was cut short")
+    spec = source.spec()
+    last = spec.height - 1, spec.height, 0, 0, spec.nchannels
+    row = source.read_scanlines(*last, OpenImageIO.FLOAT)
+    whole = row is not None and not source.geterror()
+    source.close()
+    if not whole:
+        raise OSError("it was cut short")
 
 
 def read_exr(path: Path) -> tuple[NDArray[np.float32], tuple[str, ...]]:

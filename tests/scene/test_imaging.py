@@ -227,7 +227,9 @@ def test_an_exr_that_cannot_be_written_is_told(tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="needs a limit on the size of files")
-def test_an_exr_that_does_not_fit_on_the_disk_leaves_nothing(tmp_path: Path) -> None:
+@pytest.mark.parametrize("missing", [20000, 3000, 900, 1])
+def test_an_exr_that_does_not_fit_on_the_disk_leaves_nothing(tmp_path: Path, missing: int) -> None:
+    """Not even if only its last bytes do not, which OpenImageIO writes when it closes the file."""
     program = f"""
 import resource, signal
 from pathlib import Path
@@ -236,10 +238,14 @@ from gsdmsr_cli.scene import imaging
 from gsdmsr_cli.scene.picture_files import IN_CAPTURES
 from gsdmsr_cli.ground.errors import DataError
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-resource.setrlimit(resource.RLIMIT_FSIZE, (20000, 20000))
 image = np.random.default_rng(0).random((100, 100, 1)).astype(np.float32)
+path = Path({str(tmp_path / "a.exr")!r})
+imaging.write_exr(path, image, ("Z",))
+limit = path.stat().st_size - {missing}
+path.unlink()
+resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
 try:
-    imaging.write_exr(Path({str(tmp_path / "a.exr")!r}), image, ("Z",))
+    imaging.write_exr(path, image, ("Z",))
 except DataError as error:
     print(error)
 """
