@@ -140,10 +140,18 @@ def _require_printable(arguments: list[str]) -> None:
     """Raise UsageError if an argument would steer a terminal or is not text: names are printed."""
     for argument in arguments:
         if not is_printable(argument.translate({9: " ", 10: " ", 13: " "})):
+            _require_names_in_utf8(argument)
             raise UsageError(
                 f"{argument}: this argument has control characters or is not UTF-8; rename the "
                 "file or give another path to it"
             )
+
+
+def _require_names_in_utf8(argument: str) -> None:
+    """Raise UsageError if the argument is UTF-8 and Python has been told that names are not."""
+    encoding = sys.getfilesystemencoding()
+    if encoding != "utf-8" and is_printable(os.fsencode(argument).decode(errors="surrogateescape")):
+        raise UsageError(f"{argument}: Python takes names for {encoding} here; set PYTHONUTF8=1")
 
 
 @contextmanager
