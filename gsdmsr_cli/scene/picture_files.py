@@ -37,10 +37,15 @@ _SUFFIXES = {
     "webp": (".webp",), "openexr": (".exr",),
 }  # fmt: skip
 
-_LEAST_BITS = ("png", "jpeg", "bmp", "openexr")
-"""Kinds whose every ``_PIXELS_PER_BYTE`` pixels take a byte or more."""
+PIXELS_PER_BYTE = 8 * 1032
+"""More than this a byte cannot hold: of one bit, deflated. Few kinds of compression reach more."""
 
-_PIXELS_PER_BYTE = 8 * 1032  # of one bit, deflated; other kinds of compression reach less
+_MOST_PER_BYTE = {
+    "png": PIXELS_PER_BYTE, "jpeg": PIXELS_PER_BYTE, "bmp": PIXELS_PER_BYTE,
+    "openexr": PIXELS_PER_BYTE, "tiff none": 8, "tiff packbits": 8 * 64, "tiff lzw": 8 * 2560,
+    "tiff zip": PIXELS_PER_BYTE, "tiff jpeg": PIXELS_PER_BYTE,
+}  # fmt: skip
+"""Pixels that a byte can hold at most; a plain picture of other kinds may take next to nothing."""
 
 
 @contextmanager
@@ -132,7 +137,8 @@ def _require_bearable(path: Path, spec: OpenImageIO.ImageSpec, kind: str, size: 
         )
     if spec.nchannels > 4:
         raise DataError(f"image {path} has {spec.nchannels} channels; allowed: grey, RGB and RGBA")
-    if kind in _LEAST_BITS and width * height > _PIXELS_PER_BYTE * size:
+    packed = f"tiff {spec.get('compression', '')}" if kind == "tiff" else kind
+    if width * height > _MOST_PER_BYTE.get(packed, MOST_PIXELS) * size:
         raise DataError(unreadable(path, f"{size} bytes cannot hold {width} x {height} px"))
 
 

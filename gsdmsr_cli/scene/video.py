@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from gsdmsr_cli.ground.errors import DataError
 from gsdmsr_cli.scene.native import cv2, load_av
-from gsdmsr_cli.scene.picture_files import MOST_PIXELS, MOST_SIDE
+from gsdmsr_cli.scene.picture_files import MOST_PIXELS, MOST_SIDE, PIXELS_PER_BYTE
 
 Picture = NDArray[np.uint8]
 
@@ -29,10 +29,12 @@ LONGEST_GAP = 60.0
 _FORMATS = "mov,matroska,webm,avi,mpegts,mpeg,mpegvideo,flv,ogg,asf,gif"
 """Containers, as FFmpeg names them. Others, such as lists of files, would open further files."""
 
+_ALLOWED = {"protocol_whitelist": "file", "format_whitelist": _FORMATS}
+
 # read by OpenCV before it opens a video: what FFmpeg prints says nothing to a user
 os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
 os.environ.setdefault(
-    "OPENCV_FFMPEG_CAPTURE_OPTIONS", f"protocol_whitelist;file|format_whitelist;{_FORMATS}"
+    "OPENCV_FFMPEG_CAPTURE_OPTIONS", "|".join(f"{key};{value}" for key, value in _ALLOWED.items())
 )
 cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_ERROR)
 
@@ -114,6 +116,7 @@ def _rate(capture: cv2.VideoCapture) -> float:
 
 
 def _open(path: Path) -> cv2.VideoCapture:
+    _require_bearable(path)
     capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG) if path.is_file() else None
     if capture is None or not capture.isOpened():
         raise DataError(
@@ -130,6 +133,27 @@ def _open(path: Path) -> cv2.VideoCapture:
     return capture
 
 
+def _require_bearable(path: Path) -> None:
+    """Raise DataError if the first picture is larger than the whole file can hold.
+
+    OpenCV decodes it as soon as it opens a video, whatever memory that takes, and cannot be told
+    of a bound; this one leaves the size unknown where it is exceeded.
+    """
+    av = load_av()
+    try:
+        size = path.stat().st_size
+        most = min(PIXELS_PER_BYTE * size, MOST_PIXELS)
+        with av.open(str(path), options=_ALLOWED | {"max_pixels": str(most)}) as file:
+            sizes = [(stream.width, stream.height) for stream in file.streams.video[:1]]
+    except (av.FFmpegError, OSError, ValueError, MemoryError):
+        return  # OpenCV is asked next, and tells what it cannot open
+    if (0, 0) in sizes:
+        raise DataError(
+            f"{path}: is damaged, or its pictures have more than {most} pixels, the most in a "
+            f"video of {size} bytes; copy it again or convert it to H.264 in .mp4"
+        )
+
+
 def _require_one_size(path: Path) -> None:
     """Raise DataError if the pictures change their size, which OpenCV would hide by stretching."""
     about = path.stat()
@@ -144,9 +168,8 @@ def _sizes(path: Path, _modified: int, _length: int) -> list[tuple[int, int]]:
     """Return the sizes of the keyframes, at which alone a video can change; none if undecodable."""
     av = load_av()
     sizes: dict[tuple[int, int], None] = {}
-    options = {"protocol_whitelist": "file", "format_whitelist": _FORMATS}
     try:
-        with av.open(str(path), options=options) as file:
+        with av.open(str(path), options=_ALLOWED) as file:
             file.streams.video[0].codec_context.skip_frame = "NONKEY"
             for frame in file.decode(video=0):
                 sizes[frame.width, frame.height] = None

@@ -16,9 +16,11 @@ from gsdmsr_cli.scene import video
 from gsdmsr_cli.scene.video import read_video, video_length
 
 
-def write(path: Path, stamps: Iterable[int], size: tuple[int, int] = (64, 48)) -> Path:
+def write(
+    path: Path, stamps: Iterable[int], size: tuple[int, int] = (64, 48), codec: str = "mpeg4"
+) -> Path:
     """Write frames that are shown at ``stamps`` / 25 s."""
-    codec = "mpeg2video" if path.suffix == ".ts" else "mpeg4"
+    codec = "mpeg2video" if path.suffix == ".ts" else codec
     with av.open(str(path), "w", format="mpegts" if path.suffix == ".ts" else None) as out:
         stream = out.add_stream(codec, rate=25)
         stream.width, stream.height, stream.pix_fmt = *size, "yuv420p"
@@ -105,6 +107,19 @@ def test_a_video_of_huge_pictures_is_refused(
     monkeypatch.setattr(video, "MOST_SIDE", 50)
     with pytest.raises(DataError, match="is 64 x 48 px; allowed: up to 50 px a side"):
         next(read_video(path))
+
+
+def test_a_video_of_pictures_that_its_bytes_cannot_hold_is_refused(tmp_path: Path) -> None:
+    path = write(tmp_path / "a.webm", range(3), codec="libvpx-vp9")
+    content = bytearray(path.read_bytes())
+    at = content.index(b"\x49\x83\x42") + 3  # a keyframe; 4 bits later follows its size
+    head = int.from_bytes(content[at : at + 5], "big")
+    head = (head >> 36 << 36) | (15999 << 20) | (15999 << 4) | (head & 15)
+    content[at : at + 5] = head.to_bytes(5, "big")
+    path.write_bytes(content)
+    for read in (video_length, lambda path: list(read_video(path))):
+        with pytest.raises(DataError, match=r"webm: is damaged, or its pictures have more than"):
+            read(path)
 
 
 def test_a_video_without_an_end_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -15,6 +15,7 @@ from datasets import noise, write_picture
 
 from gsdmsr_cli.ground.errors import DataError
 from gsdmsr_cli.scene import imaging
+from gsdmsr_cli.scene.picture_files import IN_SCENES
 
 
 def png(width: int, height: int, depth: int = 8, colour: int = 0, data: bytes = b"") -> bytes:
@@ -29,10 +30,10 @@ def png(width: int, height: int, depth: int = 8, colour: int = 0, data: bytes = 
     return b"\x89PNG\r\n\x1a\n" + b"".join(parts)
 
 
-def refused(path: Path, message: str) -> None:
+def refused(path: Path, message: str, kinds: tuple[str, ...] = IN_SCENES) -> None:
     for read in (imaging.read_image, imaging.image_size):
         with pytest.raises(DataError, match=message) as error:
-            read(path)
+            read(path, kinds)
         assert str(path) in str(error.value) and str(error.value).isprintable()
 
 
@@ -92,3 +93,19 @@ def test_what_only_a_name_makes_a_picture_is_none(tmp_path: Path) -> None:
     path = tmp_path / "a.null"
     path.write_bytes(b"anything")
     refused(path, "no known kind")
+
+
+@pytest.mark.parametrize(("compression", "fits"), [(1, 40), (5, 150), (8, 150), (32773, 100)])
+def test_a_tiff_that_promises_more_than_it_can_hold_is_refused(
+    tmp_path: Path, compression: int, fits: int
+) -> None:
+    path, settings = tmp_path / "a.tiff", (cv2.IMWRITE_TIFF_COMPRESSION, compression)
+    assert cv2.imwrite(str(path), np.zeros((fits, fits, 3), np.uint8), settings)
+    assert imaging.image_size(path, ("tiff",)) == (fits, fits)
+    sized = path.read_bytes()
+    for tag in (256, 257):  # width and height
+        for kind in (3, 4):  # of two bytes or of four
+            entry = struct.pack("<HHII", tag, kind, 1, fits)
+            sized = sized.replace(entry, struct.pack("<HHII", tag, kind, 1, 16000))
+    path.write_bytes(sized)
+    refused(path, "bytes cannot hold 16000 x 16000 px", ("tiff",))
