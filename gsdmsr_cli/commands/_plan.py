@@ -13,6 +13,7 @@ from gsdmsr_cli.commands._info_scene import facts_of
 from gsdmsr_cli.commands.presets import describe_options
 from gsdmsr_cli.ground import say
 from gsdmsr_cli.training.gradients.workers import processes_for
+from gsdmsr_cli.training.memory import estimate
 from gsdmsr_cli.training.trainer import Trainer
 
 
@@ -21,7 +22,9 @@ def say_plan(trainer: Trainer, name: str, reason: str | None, device: str) -> No
     options = trainer.preset
     described = describe_options(options)
     changed = {o["key"]: o["value"] for o in described if o["value"] != o["default"]}
-    camera = trainer.renderer.pictures.camera(trainer.scene.split("train")[0])
+    views = trainer.scene.split("train")
+    camera = trainer.renderer.pictures.camera(views[0])
+    processes = processes_for(options.training.views_per_step) if device == "cpu" else 1
     plan: dict[str, Any] = {
         "preset": name,
         "reason": reason,
@@ -30,31 +33,28 @@ def say_plan(trainer: Trainer, name: str, reason: str | None, device: str) -> No
         "splats": len(trainer.model.splats),
         "splats_at_most": options.density.cap,
         "size": [camera.width, camera.height],
-        "pictures_mib": _pictures_mib(trainer),
+        "memory_mib": estimate(views, options, processes).in_mib(),
         "device": device,
         "threads": threads(),
-        "processes": processes_for(options.training.views_per_step) if device == "cpu" else 1,
+        "processes": processes,
     }
     document = {"dry_run": True, **plan, "options": changed, "scene": facts_of(trainer.scene)}
     say.result(document, _table(plan), _options(changed), "nothing has been written")
-
-
-def _pictures_mib(trainer: Trainer) -> int:
-    """Return the memory that the train pictures and their halves would take, within the bound."""
-    views, pictures = trainer.scene.split("train"), trainer.renderer.pictures
-    cameras = [pictures.camera(view) for view in views]
-    halves = 1.25 if trainer.preset.training.low_resolution_until > 0 else 1.0
-    size = sum(3 * camera.width * camera.height for camera in cameras) * halves
-    return min(round(size / (1 << 20)), trainer.preset.data.cache_mib)
 
 
 def _table(plan: dict[str, Any]) -> Table:
     table = Table(show_header=False)
     for key, value in plan.items():
         if value is not None:
-            text = " x ".join(map(str, value)) if isinstance(value, list) else str(value)
-            table.add_row(key.replace("_", " "), escape(text))
+            table.add_row(key.replace("_", " "), escape(_text(value)))
     return table
+
+
+def _text(value: Any) -> str:
+    if isinstance(value, dict):  # a sum and its parts
+        total, *parts = value.items()
+        return f"{total[1]} ({', '.join(f'{name} {size}' for name, size in parts if size)})"
+    return " x ".join(map(str, value)) if isinstance(value, list) else str(value)
 
 
 def _options(changed: dict[str, Any]) -> str:

@@ -44,6 +44,7 @@ _MOST_PER_BYTE = {
     "png": PIXELS_PER_BYTE, "jpeg": PIXELS_PER_BYTE, "bmp": PIXELS_PER_BYTE,
     "openexr": PIXELS_PER_BYTE, "tiff none": 8, "tiff packbits": 8 * 64, "tiff lzw": 8 * 2560,
     "tiff zip": PIXELS_PER_BYTE, "tiff jpeg": PIXELS_PER_BYTE,
+    "webp": 65536,  # three times what a plain lossless one reaches
 }  # fmt: skip
 """Pixels that a byte can hold at most; a plain picture of other kinds may take next to nothing."""
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 
 from gsdmsr_cli.options.preset import Preset
 from gsdmsr_cli.scene.block_store import BLOCK, blocks
@@ -42,6 +42,11 @@ class Estimate:
     def total(self) -> int:
         """All of it [bytes]."""
         return self.pictures + self.splats + self.processes + self.drawing
+
+    def in_mib(self) -> dict[str, int]:
+        """Return the sum, as ``total``, and the parts by their names [MiB]."""
+        sizes = {"total": self.total, **asdict(self)}
+        return {name: _mib(size) for name, size in sizes.items()}
 
 
 def estimate(views: tuple[View, ...], preset: Preset, processes: int) -> Estimate:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+import re
 import shlex
 import sys
 from collections.abc import Iterator
+from dataclasses import asdict
 from pathlib import Path
 
 import numba
@@ -20,6 +22,7 @@ from gsdmsr_cli.ground.errors import UsageError
 from gsdmsr_cli.options.preset import load_preset
 from gsdmsr_cli.runs.run import open_run
 from gsdmsr_cli.scene.scene import Scene
+from gsdmsr_cli.training.memory import estimate
 
 STEPS = ["training.steps=2"]
 
@@ -150,6 +153,11 @@ def test_a_dry_run_says_what_would_be_done_and_writes_nothing(
     assert "density.cap" not in plan["options"]  # which is the default
     assert plan["scene"]["pictures"]["train"] == 12 and plan["size"] == [48, 48]
     assert plan["device"] == "cpu" and 1 <= plan["processes"] <= 2
+    views, options = read_scene(tiny_scene).split("train"), load_preset("dnerf", None, [])
+    expected = estimate(views, options, plan["processes"])
+    sizes = asdict(expected) | {"total": expected.total}
+    assert plan["memory_mib"] == {name: round(size / (1 << 20)) for name, size in sizes.items()}
+    assert plan["memory_mib"]["splats"] > 0 and plan["memory_mib"]["total"] > 0
     assert gsdmsr(f"{line} --steps 2", monkeypatch) == 0
     files = {path: path.read_bytes() for path in run.iterdir()}
     assert gsdmsr(f"{line} --steps 2 --dry-run", monkeypatch) == 3  # RUN is in use
@@ -157,6 +165,7 @@ def test_a_dry_run_says_what_would_be_done_and_writes_nothing(
     assert gsdmsr(f"{line} --steps 7 --resume --dry-run", monkeypatch) == 0
     out = capsys.readouterr().out
     assert "begins at step │ 2" in out and "nothing has been written" in out
+    assert re.search(r"memory mib +│ \d+ \(pictures \d+, splats \d+", out)
     assert {path: path.read_bytes() for path in run.iterdir()} == files
 
 

@@ -109,3 +109,19 @@ def test_a_tiff_that_promises_more_than_it_can_hold_is_refused(
             sized = sized.replace(entry, struct.pack("<HHII", tag, kind, 1, 16000))
     path.write_bytes(sized)
     refused(path, "bytes cannot hold 16000 x 16000 px", ("tiff",))
+
+
+def test_a_webp_that_promises_more_than_it_can_hold_is_refused(tmp_path: Path) -> None:
+    lossless = (cv2.IMWRITE_WEBP_QUALITY, 101)
+    content = bytearray(cv2.imencode(".webp", noise(8, 10, 3), lossless)[1].tobytes())
+    at = content.index(b"VP8L") + 9
+    head = int.from_bytes(content[at : at + 4], "little") >> 28 << 28
+    content[at : at + 4] = (head | 9404 << 14 | 12079).to_bytes(4, "little")
+    (tmp_path / "a.webp").write_bytes(content)
+    refused(tmp_path / "a.webp", "bytes cannot hold 12080 x 9405 px", ("webp",))
+
+
+def test_a_plain_webp_is_read(tmp_path: Path) -> None:
+    lossless = (cv2.IMWRITE_WEBP_QUALITY, 101)
+    assert cv2.imwrite(str(tmp_path / "a.webp"), np.zeros((3000, 4000, 3), np.uint8), lossless)
+    assert imaging.image_size(tmp_path / "a.webp", ("webp",)) == (4000, 3000)
