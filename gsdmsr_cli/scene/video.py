@@ -144,7 +144,8 @@ def _require_bearable(path: Path) -> None:
         size = path.stat().st_size
         most = min(PIXELS_PER_BYTE * size, MOST_PIXELS)
         with av.open(str(path), options=_ALLOWED | {"max_pixels": str(most)}) as file:
-            sizes = [(stream.width, stream.height) for stream in file.streams.video[:1]]
+            contexts = [stream.codec_context for stream in file.streams.video[:1]]
+            sizes = [(c.width, c.height) for c in contexts if c is not None]  # of known codecs
     except (av.FFmpegError, OSError, ValueError, MemoryError):
         return  # OpenCV is asked next, and tells what it cannot open
     if (0, 0) in sizes:

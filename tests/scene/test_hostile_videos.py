@@ -122,6 +122,13 @@ def test_a_video_of_pictures_that_its_bytes_cannot_hold_is_refused(tmp_path: Pat
             read(path)
 
 
+def test_a_video_of_an_unknown_codec_is_refused(tmp_path: Path) -> None:
+    path = write(tmp_path / "a.webm", range(3), codec="libvpx-vp9")
+    path.write_bytes(path.read_bytes().replace(b"V_VP9", b"V_VPx"))
+    with pytest.raises(DataError, match=r"a\.webm: no video stream"):
+        video_length(path)
+
+
 def test_a_video_without_an_end_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = write(tmp_path / "a.mp4", range(9))
     monkeypatch.setattr(video, "MOST_FRAMES", 7)
