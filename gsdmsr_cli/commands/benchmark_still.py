@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from copy import deepcopy
 from dataclasses import replace
 from pathlib import Path
 from statistics import median
@@ -49,7 +50,7 @@ def _measure(trained: Trained, below: Sequence[float], split: str) -> list[dict[
     saliency, mean = motion_saliency(trained.renderer.model, camera)
     models = {0.0: trained.renderer.model}
     for threshold in below:
-        models[threshold], _ = trained.run.load_model()
+        models[threshold] = deepcopy(trained.renderer.model)
         change = let_stand_still(models[threshold], saliency < threshold, mean)
         resize_model(models[threshold], change)
     speeds = _speeds(trained, models, views)

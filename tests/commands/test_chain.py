@@ -24,6 +24,7 @@ from motion_checks import splats_at
 from gsdmsr_cli.cli.main import main
 from gsdmsr_cli.evaluation import speed
 from gsdmsr_cli.exports._ply import read_ply
+from gsdmsr_cli.runs import checkpoints
 from gsdmsr_cli.runs.run import open_run
 from gsdmsr_cli.scene.imaging import read_image
 
@@ -223,6 +224,17 @@ def test_benchmark_still_compares_thresholds(gsdmsr: Gsdmsr, run: Path) -> None:
     assert "as trained" in gsdmsr(*line, "--below", "1").out
     refused = gsdmsr(*line, "--below", "0")
     assert refused.code == 2 and refused.err.endswith("error: --below 0.0: must be above 0\n")
+
+
+def test_benchmark_still_reads_the_checkpoint_once(
+    gsdmsr: Gsdmsr, run: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A training that goes on there would else mix two models in one table."""
+    real, reads = checkpoints.read, list[Path]()
+    monkeypatch.setattr(checkpoints, "read", lambda path: (reads.append(path), real(path))[1])
+    line = "--below", "0.1", "--below", "1", "--below", "2"
+    assert gsdmsr("benchmark", "still", run, "--split", "test", *line).code == 0
+    assert len(reads) == 1
 
 
 def test_eval_takes_another_split_background_and_size(gsdmsr: Gsdmsr, run: Path) -> None:

@@ -40,20 +40,25 @@ class Point:
     fault: str | None
 
 
+Row = tuple[Work, int, list[Point]]
+"""A command, how many changes it makes, and what became of its kills."""
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n", 1)[0])
     parser.add_argument("--points", type=int, default=200, help="how many kills")
     parser.add_argument("--seed", type=int, default=0, help="of their places")
     parser.add_argument("--at-once", type=int, default=2, help="how many commands at a time")
     given = parser.parse_args()
-    began = time.perf_counter()
-    with tempfile.TemporaryDirectory(prefix="gsdmsr-kills-") as root:
-        Path(root, "data").mkdir()
-        rows = [
-            (work, *_kill(work, Path(root), round(work.share * given.points), given))
-            for work in works(Path(root, "data"))
-        ]
-    _print(rows, time.perf_counter() - began)
+    began, rows = time.perf_counter(), list[Row]()
+    try:
+        with tempfile.TemporaryDirectory(prefix="gsdmsr-kills-") as root:
+            Path(root, "data").mkdir()
+            for work in works(Path(root, "data")):
+                count = round(work.share * given.points)
+                rows.append((work, *_kill(work, Path(root), count, given)))
+    finally:  # Ctrl-C leaves the table of what is finished
+        _print(rows, time.perf_counter() - began)
     sys.exit(any(point.fault for _, _, points in rows for point in points))
 
 
@@ -106,7 +111,7 @@ def _point(work: Work, out: Path, number: int, expected: Any) -> Point:
     return Point(number, ended.killed, None)
 
 
-def _print(rows: list[tuple[Work, int, list[Point]]], seconds: float) -> None:
+def _print(rows: list[Row], seconds: float) -> None:
     table = Table("command", "changes of the disk", "points", "killed", "sound after it")
     for work, changes, points in rows:
         sound = sum(point.fault is None for point in points)
