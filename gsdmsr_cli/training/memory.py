@@ -56,7 +56,7 @@ def estimate(views: tuple[View, ...], preset: Preset, processes: int) -> Estimat
     whole = sum(_kept(3 * w * h) + n * _kept(w * h) for w, h, n in sizes)
     halved = sum(_kept(3 * (w // 2) * (h // 2)) for w, h, _ in sizes)
     tensors = 4 * (_VALUES + _HARMONICS * (preset.splats.sh_degree + 1) ** 2)
-    most = max(preset.density.cap, preset.splats.count)
+    most = preset.density.cap
     pixels = max((w * h for w, h, _ in sizes), default=0)
     return Estimate(
         pictures=min(whole + halved, preset.data.cache_mib << 20),
