@@ -29,6 +29,7 @@ from gsdmsr_cli.runs.run import SCHEMA, Run, require_apart
 from gsdmsr_cli.scene.pictures import Pictures
 from gsdmsr_cli.scene.scene import Scene
 from gsdmsr_cli.training import memory
+from gsdmsr_cli.training.gradients.workers import processes_for
 from gsdmsr_cli.training.loop import Report, train
 from gsdmsr_cli.training.request import Request
 from gsdmsr_cli.training.trainer import Trainer
@@ -180,7 +181,7 @@ def _write_account(
 
 def _warn_of_memory(scene: Scene, options: Preset, device: str) -> None:
     """Say so if the training may take more memory than there is."""
-    processes = min(options.training.views_per_step, threads()) if device == "cpu" else 1
+    processes = processes_for(options.training.views_per_step) if device == "cpu" else 1
     expected = memory.estimate(scene.split("train"), options, processes)
     text = memory.warning(expected, limits.available_memory())
     if text is not None:

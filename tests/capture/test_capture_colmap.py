@@ -122,7 +122,7 @@ def test_the_number_of_cores_changes_no_match(
     pairs = choose_pairs(6, "exhaustive", False)
     found = []
     for cores in (1, 3):
-        monkeypatch.setattr(colmap_jobs.os, "cpu_count", lambda cores=cores: cores)
+        monkeypatch.setattr(colmap_jobs, "cores", lambda cores=cores: cores)
         out = tmp_path / str(cores)
         out.mkdir()
         names = [path.name for path in paths]

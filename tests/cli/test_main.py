@@ -23,10 +23,9 @@ from gsdmsr_cli.ground.printing import is_printable, one_line
 Gsdmsr = Any  # the fixture of conftest.py
 
 
-def python(*arguments: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, *arguments], capture_output=True, text=True, timeout=60, check=False
-    )
+def python(*arguments: str, env: dict[str, str] | None = None) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, *arguments]
+    return subprocess.run(command, capture_output=True, text=True, timeout=60, env=env)
 
 
 def test_the_package_runs_as_a_module() -> None:
@@ -68,7 +67,9 @@ def test_a_shell_completes_commands_presets_and_formats(words: str, expected: se
 
 
 def test_the_script_for_completion_is_shown() -> None:
-    done = python("-m", "gsdmsr_cli", "--show-completion", "bash")
+    # the shell is named, or typer would look for one among the parents of this process
+    named = os.environ | {"_TYPER_COMPLETE_TEST_DISABLE_SHELL_DETECTION": "1"}
+    done = python("-m", "gsdmsr_cli", "--show-completion", "bash", env=named)
     assert done.returncode == 0 and "_GSDMSR_COMPLETE=complete_bash" in done.stdout
 
 

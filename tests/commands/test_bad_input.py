@@ -274,7 +274,9 @@ def test_a_folder_without_leave_to_write_is_told(tmp_path: Path, monkeypatch: An
     files.require_folder(tmp_path / "a" / "b")
     assert (tmp_path / "a" / "b").is_dir()
     monkeypatch.setattr(files.os, "access", lambda *_: False)  # root may write everywhere
-    with pytest.raises(DataError, match="b: cannot be written; choose another folder"):
+    with pytest.raises(
+        DataError, match="b: cannot be written; choose another --out or change the rights"
+    ):
         files.require_folder(tmp_path / "a" / "b")
 
 

@@ -59,7 +59,12 @@ def test_a_connection_that_is_dropped_ends_a_training_in_order(
     call = command(tiny_scene, run, *LINE, "--steps=1000000")
     with (
         sink(SINKS[0]) as err,
-        subprocess.Popen(call, stderr=err, start_new_session=True) as training,
+        subprocess.Popen(
+            call,
+            stderr=err,
+            start_new_session=True,
+            preexec_fn=lambda: signal.signal(signal.SIGHUP, signal.SIG_DFL),  # as without nohup
+        ) as training,
     ):
         wait_until(lambda: log.exists() and log.stat().st_size)
         os.killpg(training.pid, signal.SIGHUP)

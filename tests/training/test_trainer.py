@@ -264,7 +264,7 @@ def test_a_longer_training_grows_no_more_often(
 
 
 def test_the_motion_is_told_where_the_first_splats_are(tiny_scene: Path) -> None:
-    trainer = trainer_of(tiny_scene, preset_of("splats.count=2000"))
+    trainer = trainer_of(tiny_scene, preset_of("splats.count=2000", "density.cap=2000"))
     lower, upper = torch.tensor(trainer.facts.box)
     means = trainer.model.splats.means.detach()
     outside = ((means < lower) | (means > upper)).float().mean(dim=0)

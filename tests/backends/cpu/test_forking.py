@@ -117,7 +117,12 @@ Forks(sys.argv[1]).do(f"{sys.argv[2]} sleeps".encode(), os.environ)
 @pytest.mark.parametrize("end", [signal.SIGKILL, signal.SIGINT], ids=["killed", "interrupted"])
 def test_work_ends_with_who_has_asked_for_it(tmp_path: Path, end: signal.Signals) -> None:
     command = [sys.executable, "-c", ASKER, CODE, str(tmp_path)]
-    with subprocess.Popen(command, env=environment(), stderr=subprocess.DEVNULL) as asker:
+    with subprocess.Popen(
+        command,
+        env=environment(),
+        stderr=subprocess.DEVNULL,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # as in the foreground
+    ) as asker:
         asleep = tmp_path / "asleep"
         wait_until(lambda: asleep.exists() and asleep.read_text() != "")
         asker.send_signal(end)
