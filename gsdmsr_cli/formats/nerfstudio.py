@@ -44,7 +44,7 @@ def read(folder: Path) -> Scene:
     document = checks.read_json(path)
     frames = _frames(document, path)
     times = _times(frames)
-    splits = _splits(document, [fields["file_path"] for _, fields in frames], path)
+    splits = _splits(document, [_name(fields, where) for where, fields in frames], path)
     views = [
         _read_view(folder, split, time, fields, where)
         for (where, fields), time, split in zip(frames, times, splits, strict=True)
@@ -87,6 +87,13 @@ def _times(frames: list[tuple[str, dict[str, Any]]]) -> list[float]:
     if not any("time" in fields for _, fields in frames):
         return [i / max(len(frames) - 1, 1) for i in range(len(frames))]
     return [checks.unit_time(fields.get("time"), f"{where}: time") for where, fields in frames]
+
+
+def _name(fields: dict[str, Any], where: str) -> str:
+    name = fields["file_path"]
+    if not isinstance(name, str):
+        raise DataError(f"{where}: file_path is {checks.shown(name)}; it must name a file")
+    return name
 
 
 def _splits(document: dict[str, Any], names: list[str], path: Path) -> list[str | None]:

@@ -246,4 +246,10 @@ def test_a_list_in_place_of_a_name_is_refused(tmp_path: Path) -> None:
     frame = {"file_path": ["a.png"], "transform_matrix": pose()}
     document = {"camera_angle_x": 0.7, "frames": [frame], "train_filenames": [["a.png"]]}
     write_json(tmp_path / "transforms.json", document)
-    assert_refused(tmp_path, "is the file_path of no frame")
+    assert_refused(tmp_path, "it must name a file")
+
+
+def test_a_frame_that_names_its_picture_by_an_object_is_told(tmp_path: Path) -> None:
+    frame = {"file_path": {"a": 1}, "transform_matrix": pose()}
+    write_json(tmp_path / "transforms.json", {"frames": [frame], "train_filenames": ["a.png"]})
+    assert_refused(tmp_path, "it must name a file")
