@@ -13,12 +13,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import torch
 
-from gsdmsr_cli.cli.main import main
 from gsdmsr_cli.commands import render as render_command
 from gsdmsr_cli.commands import train as train_command
-from gsdmsr_cli.evaluation import speed
 from gsdmsr_cli.formats import read_scene
 from gsdmsr_cli.ground.errors import DataError
 from gsdmsr_cli.ground.locks import one_of_readers, sole_writer
@@ -48,23 +45,6 @@ def trained(tiny_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def run(trained: Path, tmp_path: Path) -> Run:
     return open_run(Path(shutil.copytree(trained, tmp_path / "run")))
-
-
-@pytest.fixture
-def gsdmsr(monkeypatch: pytest.MonkeyPatch) -> Gsdmsr:
-    monkeypatch.setattr(speed, "SECONDS", 0.05)
-    monkeypatch.delenv("GSDMSR_DEBUG", raising=False)
-    threads = torch.get_num_threads()
-
-    def call(*words: object) -> int:
-        monkeypatch.setattr(sys, "argv", ["gsdmsr", *map(str, words)])
-        with pytest.raises(SystemExit) as ended:
-            main()
-        assert isinstance(ended.value.code, int)
-        return ended.value.code
-
-    yield call
-    torch.set_num_threads(threads)
 
 
 FILM = "--path", "orbit", "--frames", "2", "--video", "none"

@@ -17,7 +17,6 @@ import pytest
 import torch
 from datasets import noise, write_picture
 
-from gsdmsr_cli.cli.main import main
 from gsdmsr_cli.commands import _beginning
 from gsdmsr_cli.commands import train as train_command
 from gsdmsr_cli.commands._trained import open_trained
@@ -36,19 +35,6 @@ from gsdmsr_cli.training.trainer import Trainer
 Gsdmsr = Callable[..., int]
 
 FEW = ("splats.count=20", "splats.start=box", "motion={name: static}")
-
-
-@pytest.fixture
-def gsdmsr(monkeypatch: pytest.MonkeyPatch) -> Gsdmsr:
-    def call(*arguments: object) -> int:
-        monkeypatch.setattr(sys, "argv", ["gsdmsr", *map(str, arguments)])
-        with pytest.raises(SystemExit) as ended:
-            main()
-        assert isinstance(ended.value.code, int)
-        return ended.value.code
-
-    monkeypatch.delenv("GSDMSR_DEBUG", raising=False)
-    return call
 
 
 @pytest.fixture

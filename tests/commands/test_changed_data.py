@@ -4,17 +4,13 @@ from __future__ import annotations
 
 import json
 import shutil
-import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
-import torch
 
-from gsdmsr_cli.cli.main import main
-from gsdmsr_cli.evaluation import speed
 from gsdmsr_cli.formats import read_scene
 from gsdmsr_cli.options.preset import load_preset
 from gsdmsr_cli.raster import best_engine
@@ -42,23 +38,6 @@ def begun(tiny_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def run(begun: Path, tmp_path: Path) -> Run:
     shutil.copytree(begun, tmp_path / "here")
     return replace(open_run(tmp_path / "here" / "run"), data=tmp_path / "here" / "data")
-
-
-@pytest.fixture
-def gsdmsr(monkeypatch: pytest.MonkeyPatch) -> Gsdmsr:
-    monkeypatch.setattr(speed, "SECONDS", 0.05)
-    monkeypatch.delenv("GSDMSR_DEBUG", raising=False)
-    threads = torch.get_num_threads()
-
-    def call(*words: object) -> int:
-        monkeypatch.setattr(sys, "argv", ["gsdmsr", *map(str, words)])
-        with pytest.raises(SystemExit) as ended:
-            main()
-        assert isinstance(ended.value.code, int)
-        return ended.value.code
-
-    yield call
-    torch.set_num_threads(threads)
 
 
 def about(run: Run) -> dict[str, Any]:

@@ -6,13 +6,10 @@ import json
 import re
 import shlex
 import sys
-from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
 
-import numba
 import pytest
-import torch
 from datasets import write_dnerf
 
 from gsdmsr_cli.cli.main import main
@@ -25,15 +22,6 @@ from gsdmsr_cli.scene.scene import Scene
 from gsdmsr_cli.training.memory import estimate
 
 STEPS = ["training.steps=2"]
-
-
-@pytest.fixture(autouse=True)
-def threads_as_before() -> Iterator[None]:
-    """Training says how many threads numba and torch use."""
-    before = numba.get_num_threads(), torch.get_num_threads()
-    yield
-    numba.set_num_threads(before[0])
-    torch.set_num_threads(before[1])
 
 
 @pytest.fixture

@@ -7,13 +7,12 @@ import os
 import re
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
-import numba
 import numpy as np
 import pytest
 import torch
@@ -51,15 +50,6 @@ def gsdmsr(*arguments: object) -> int:
             main()
     assert isinstance(ended.value.code, int)
     return ended.value.code
-
-
-@pytest.fixture(scope="module", autouse=True)
-def threads_as_before() -> Iterator[None]:
-    """Training says how many threads numba and torch use."""
-    before = numba.get_num_threads(), torch.get_num_threads()
-    yield
-    numba.set_num_threads(before[0])
-    torch.set_num_threads(before[1])
 
 
 @pytest.fixture(scope="module")

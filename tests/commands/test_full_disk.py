@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
-import numba
 import pytest
-import torch
 from full_disk import full_at_every_change, has_failed
 
 from gsdmsr_cli.cli.main import main
@@ -24,15 +22,6 @@ from gsdmsr_cli.runs.run import open_run
 FEW = "--preset=dnerf", "--steps=2", "--threads=1", "--set=splats.count=100"
 
 Gsdmsr = Callable[..., tuple[int, str]]
-
-
-@pytest.fixture(scope="module", autouse=True)
-def threads_as_before() -> Iterator[None]:
-    """Training says how many threads numba and torch use."""
-    before = numba.get_num_threads(), torch.get_num_threads()
-    yield
-    numba.set_num_threads(before[0])
-    torch.set_num_threads(before[1])
 
 
 @pytest.fixture
