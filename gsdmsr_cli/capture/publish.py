@@ -20,7 +20,7 @@ from gsdmsr_cli.capture.marked import is_marked, mark, remove_marked
 from gsdmsr_cli.capture.write import NOTE, POINTS, REPORT, TIMINGS
 from gsdmsr_cli.formats.nerfstudio import MASK_KEYS, SIGN
 from gsdmsr_cli.ground.errors import DataError, UsageError
-from gsdmsr_cli.ground.files import leftovers, read_json
+from gsdmsr_cli.ground.files import read_json, remove_leftovers
 
 _FILES = (SIGN, NOTE, POINTS, REPORT, TIMINGS)
 _FOLDERS = ("images", *sorted(FOLDERS.values()))
@@ -111,8 +111,7 @@ def publish(scene: Path, place: Path) -> None:
         DataError: it cannot be written; what has not been moved is kept for the next try.
     """
     try:
-        for left in leftovers(scene):
-            left.unlink()
+        remove_leftovers(scene)
         place.parent.mkdir(parents=True, exist_ok=True)
         if not place.exists() and _rename(scene, place):
             return

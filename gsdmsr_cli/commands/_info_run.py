@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from gsdmsr_cli.commands._found import Found
+from gsdmsr_cli.commands._results import EVALUATION, METRICS
 from gsdmsr_cli.evaluation import protocol
 from gsdmsr_cli.formats import needs_preparing, read_scene
 from gsdmsr_cli.ground.errors import DataError
@@ -55,7 +56,7 @@ def _trained(run: Run) -> dict[str, Any]:
         **psnr,
         "checkpoint_bytes": run.checkpoint_path.stat().st_size,
         **protocol.storage(checkpoint.tensors),
-        "evaluated": (run.root / "eval" / "metrics.json").is_file(),
+        "evaluated": (run.root / EVALUATION / METRICS).is_file(),
     }
 
 

@@ -9,6 +9,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from gsdmsr_cli.commands._progress import progress_bar
+from gsdmsr_cli.commands._results import EVALUATION, METRICS
 from gsdmsr_cli.commands._trained import open_trained
 from gsdmsr_cli.evaluation.comparison import Compared, compare, most_disputed, rows_of
 from gsdmsr_cli.evaluation.gates import read_report
@@ -68,13 +69,13 @@ def _names(paths: Sequence[Path]) -> list[str]:
 
 
 def _is_report_of_run(path: Path) -> bool:
-    return path.is_file() and path.parent.name == "eval"
+    return path.is_file() and path.parent.name == EVALUATION
 
 
 def _read(path: Path) -> Document:
     if path.is_file():
         return read_report(path)
-    report = path / "eval" / "metrics.json"
+    report = path / EVALUATION / METRICS
     if not report.is_file():
         raise DataError(f"{path}: has not been evaluated; run gsdmsr eval {path} first")
     return read_report(report)
