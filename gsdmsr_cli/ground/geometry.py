@@ -52,12 +52,20 @@ def quat_to_rotmat(quats: Tensor) -> Tensor:
     return torch.stack(rows, -1).reshape(-1, 3, 3)
 
 
+def scaled_axes(quats: Tensor, log_scales: Tensor) -> Tensor:
+    """Return the (N, 3, 3) matrices R diag(exp(log_scales)), whose columns are axes [world units].
+
+    quats is (N, 4) wxyz of any norm, log_scales (N, 3).
+    """
+    return quat_to_rotmat(quats) * log_scales.exp().unsqueeze(-2)
+
+
 def covariance(quats: Tensor, log_scales: Tensor) -> Tensor:
     """Return the (N, 3, 3) covariances R diag(exp(log_scales))^2 R^T [world units^2].
 
     quats is (N, 4) wxyz of any norm, log_scales (N, 3).
     """
-    axes = quat_to_rotmat(quats) * log_scales.exp().unsqueeze(-2)
+    axes = scaled_axes(quats, log_scales)
     return axes @ axes.mT
 
 

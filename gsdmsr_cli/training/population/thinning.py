@@ -14,6 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from gsdmsr_cli.ground.geometry import scaled_axes
 from gsdmsr_cli.model.model import Model
 from gsdmsr_cli.options.preset import Preset
 from gsdmsr_cli.raster import Engine
@@ -79,8 +80,9 @@ def picture_sensitivity(
 
     It is the trace over these six parameters of JᵀJ, J the Jacobian of all pixels of all pictures.
     Its diagonal is estimated with one vector of random signs v a picture, whose (Jᵀv)² has that
-    expectation (Bekas, Kokiopoulou & Saad 2007). Steps of the mean count in units of the splat's
-    own scales, as those of the log scales do, so that neither depends on the unit of the world.
+    expectation (Bekas, Kokiopoulou & Saad 2007). Steps of the mean count along the splat's own axes
+    and in units of its scales, as those of the log scales do, so that neither depends on the unit
+    or the directions of the world.
 
     Args:
         model: of N splats.
@@ -101,12 +103,13 @@ def picture_sensitivity(
         picture = model.shade(frame, instant).rgb
         signs = 2 * torch.randint(0, 2, picture.shape, generator=generator) - 1
         means, slopes = torch.autograd.grad(picture, asked, signs.to(picture))
-        extents = extents.detach()
-        if axes is None:
-            sizes, log_scales = extents.exp(), slopes
-        else:  # columns of A are axes; to scale one by e^s changes A by s times that column
-            sizes, log_scales = extents.norm(dim=1), (slopes * extents).sum(dim=1)
-        total += (means * sizes).square().sum(dim=1) + log_scales.square().sum(dim=1)
+        with torch.no_grad():
+            if axes is None:
+                axes, by_scale = scaled_axes(splats.quats, extents), slopes
+            else:  # columns of A are axes; to scale one by e^s changes A by s times that column
+                by_scale = (slopes * axes).sum(dim=1)
+            by_mean = (axes * means[:, :, None]).sum(dim=1)  # Aᵀ times the gradient
+            total += by_mean.square().sum(dim=1) + by_scale.square().sum(dim=1)
     return total
 
 

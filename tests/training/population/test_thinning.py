@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,6 +18,7 @@ from training_checks import STEPS, assert_same_tensors, copies, preset_of, run_o
 
 from gsdmsr_cli.gaussians.moment import Moment
 from gsdmsr_cli.gaussians.splats import Splats
+from gsdmsr_cli.ground.geometry import scaled_axes
 from gsdmsr_cli.raster import load_engine
 from gsdmsr_cli.scene.camera import Camera
 from gsdmsr_cli.training.population.thinning import most_sensitive, picture_sensitivity
@@ -76,6 +79,36 @@ def test_the_unit_of_the_world_does_not_matter() -> None:
     larger = replace(splats, means=4 * splats.means, log_scales=splats.log_scales + math.log(4))
     found, expected = sensitivity_of(larger, "cpu", 5), sensitivity_of(splats, "cpu", 5)
     torch.testing.assert_close(found, expected, rtol=1e-3, atol=1e-5)
+
+
+def stretched_splats() -> Splats:
+    """Return those of ``row_of_splats`` with three scales each, turned at random."""
+    splats = row_of_splats()
+    quats = torch.randn(5, 4, generator=generator(1))
+    return replace(splats, quats=quats, log_scales=splats.log_scales + torch.tensor([-0.7, 0, 0.5]))
+
+
+@pytest.mark.parametrize("form", ["quats and scales", "axes"])
+def test_steps_of_the_mean_are_along_the_axes_of_turned_stretched_splats(form: str) -> None:
+    splats = stretched_splats()
+    axes = scaled_axes(splats.quats, splats.log_scales)
+
+    def draw(along: Tensor, stretch: Tensor) -> Tensor:
+        """Draw with means moved by so many times the axes, and the axes stretched by e^s."""
+        moved = replace(splats, means=splats.means + (axes @ along[..., None])[..., 0])
+        moment = Moment(moved, axes * stretch.exp()[:, None])
+        return load_engine("reference").rasterize(moment, CAMERA, BACKGROUND).rgb
+
+    parts = torch.autograd.functional.jacobian(draw, (torch.zeros(5, 3), torch.zeros(5, 3)))
+    exact = sum(part.square().sum(dim=(0, 1, 2, 4)) for part in parts)
+    model: Any = model_of(splats, started("static"))
+    if form == "axes":
+        model = SimpleNamespace(splats=splats, instant=model.instant, shade=model.shade,
+                                at=lambda instant: Moment(splats, axes))  # fmt: skip
+    shots = [(CAMERA, 0.0)] * 400
+    engine = load_engine("cpu")
+    found = picture_sensitivity(model, engine, shots, BACKGROUND, generator()) / len(shots)
+    torch.testing.assert_close(found, exact, rtol=0.15, atol=1e-6)
 
 
 def test_the_least_go_and_the_rest_keep_their_order() -> None:
