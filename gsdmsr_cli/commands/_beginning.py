@@ -103,9 +103,10 @@ class Resumed:
         self._require_rest()
 
     def _require_rest(self) -> None:
+        """Raise UsageError if the training is complete; one that was killed as it ended is not."""
         clock = new_clock(self.options.training)
         clock.step, clock.before = self._checkpoint.step, self._checkpoint.elapsed
-        if clock.progress >= 1:
+        if clock.progress >= 1 and self._earlier.account(clock.step):
             raise UsageError(
                 f"{self._earlier.root}: is complete at step {clock.step} after "
                 f"{clock.elapsed:.0f} s; give it a longer --budget or more --steps"

@@ -16,7 +16,6 @@ from gsdmsr_cli.evaluation.request import BOTH, Request
 from gsdmsr_cli.evaluation.speed import measure_speed
 from gsdmsr_cli.evaluation.summary import SCHEMA
 from gsdmsr_cli.ground import machine
-from gsdmsr_cli.ground.files import read_json
 from gsdmsr_cli.options.preset import BACKGROUNDS
 from gsdmsr_cli.scene.picture_hashes import digest
 from gsdmsr_cli.scene.scene import SPLITS, View
@@ -152,11 +151,9 @@ def _mean(scored: Scored) -> protocol.Scores:
 
 def _training(trained: Trained) -> dict[str, Any]:
     """Return how long the training took; of one that was killed there is only the log."""
-    path, checkpoint = trained.run.training_path, trained.checkpoint
-    written = read_json(path) if path.is_file() else {}
-    splats = len(trained.renderer.model.splats)
+    checkpoint, splats = trained.checkpoint, len(trained.renderer.model.splats)
     known = {"steps": checkpoint.step, "train_s": checkpoint.elapsed, "splats": splats}
-    account = known | (written if written.get("steps") == checkpoint.step else {})
+    account = known | trained.run.account(checkpoint.step)
     return account | {"stages_s": _timings(trained, account["train_s"])}
 
 

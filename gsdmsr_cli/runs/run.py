@@ -95,6 +95,17 @@ class Run:
         """How long the training took and what it ran on."""
         return self.root / _TRAINING
 
+    def account(self, step: int) -> dict[str, Any]:
+        """Return how long the training took that ended at ``step``; {} if none has ended there.
+
+        A training that was killed has none.
+
+        Raises:
+            DataError: the file cannot be read.
+        """
+        written = read_json(self.training_path) if self.training_path.is_file() else {}
+        return written if written.get("steps") == step else {}
+
     def describe(self) -> None:
         """Write what the run is, in place of what was said before."""
         about = {

@@ -21,6 +21,7 @@ import pytest
 import torch
 from motion_checks import splats_at
 
+from gsdmsr_cli.benchmark.kills import same
 from gsdmsr_cli.cli.main import main
 from gsdmsr_cli.evaluation import speed
 from gsdmsr_cli.exports._ply import read_ply
@@ -132,6 +133,26 @@ def test_training_writes_a_run_with_log_and_account(run: Path) -> None:
 
 def test_a_complete_run_is_not_resumed(gsdmsr: Gsdmsr, run: Path, data: Path) -> None:
     ended = gsdmsr("train", "--data", data, "--out", run, "--resume")
+    assert ended.code == 2 and "is complete at step 60" in ended.err
+
+
+def test_a_run_killed_after_its_last_checkpoint_is_completed(
+    gsdmsr: Gsdmsr, run: Path, data: Path, tmp_path: Path
+) -> None:
+    killed = tmp_path / "killed"
+    shutil.copytree(run, killed)
+    (killed / "training.json").unlink()
+    (killed / f".gsdmsr-{'0' * 32}.part.json").write_text("{")  # as far as it was written
+    ended = gsdmsr("train", "--data", data, "--out", killed, "--resume")
+    assert ended.code == 0, ended.err
+    assert {path.name for path in killed.iterdir()} == {path.name for path in run.iterdir()}
+    account, whole = (json.loads((of / "training.json").read_text()) for of in (killed, run))
+    assert account["steps"] == whole["steps"] and account["progress"] == 1
+    assert account["train_s"] == pytest.approx(whole["train_s"], abs=2)
+    assert (killed / "metrics.jsonl").read_bytes() == (run / "metrics.jsonl").read_bytes()
+    found, expected = (open_run(of).load() for of in (killed, run))
+    assert same(found, expected)
+    ended = gsdmsr("train", "--data", data, "--out", killed, "--resume")
     assert ended.code == 2 and "is complete at step 60" in ended.err
 
 

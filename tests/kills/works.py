@@ -81,7 +81,9 @@ def _training(data: Path) -> Work:
     def go_on(out: Path) -> Words | None:
         if not _has_saved(out):
             return [*words(out), *(["--overwrite"] if is_run(out) else [])]
-        return None if open_run(out).load().progress >= 1 else [*words(out), "--resume"]
+        checkpoint = open_run(out).load()
+        complete = checkpoint.progress >= 1 and open_run(out).account(checkpoint.step)
+        return None if complete else [*words(out), "--resume"]
 
     def alike(found: Any, expected: Any) -> bool:
         return same(found[0], expected[0]) and found[1] == expected[1]
