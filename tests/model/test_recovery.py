@@ -1,0 +1,70 @@
+"""Every motion finds the trajectories that it can say, from noise-free pictures."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import cast
+
+import pytest
+import torch
+from recovery_checks import COUNT, Case, assert_recovers, canonical_splats, lives_of, moved
+from torch import Tensor
+
+from gsdmsr_cli.gaussians.moment import Moment
+from gsdmsr_cli.model.model import Model
+
+
+def each_its_own_way(means: Tensor, time: float) -> Tensor:
+    """Every splat goes on a straight line, each in another direction."""
+    return means + (time - 0.5) * 0.5 * torch.nn.functional.normalize(means.roll(1, dims=1), dim=1)
+
+
+def along_an_arc(means: Tensor, time: float) -> Tensor:
+    """All splats go round one axis together, and up: a rigid motion."""
+    turn, rise = 0.8 * (time - 0.5), 0.3 * (time - 0.5)
+    x, y, z = means.unbind(1)
+    cos, sin = math.cos(turn), math.sin(turn)
+    return torch.stack([cos * x - sin * y, sin * x + cos * y, z + rise], dim=1)
+
+
+CASES = {
+    "control_points": Case(
+        {"name": "control_points", "count": 16, "neighbours": 4, "time_ratio": 0.5},
+        moved(along_an_arc),
+    ),
+    "multiscale": Case(
+        {"name": "multiscale", "coarse_until": 0.0, "time_ratio": 0.5}, moved(each_its_own_way)
+    ),
+}
+"""By the names of the motions; each has the trajectory that the motion is made for."""
+
+
+@pytest.mark.parametrize("case", CASES.values(), ids=CASES)
+def test_a_known_trajectory_is_recovered(case: Case, tmp_path: Path) -> None:
+    assert_recovers(case, tmp_path)
+
+
+def test_a_motion_that_cannot_say_a_trajectory_does_not_pass(tmp_path: Path) -> None:
+    """Or the test above would not say anything."""
+    still = Case({"name": "static"}, moved(along_an_arc), steps=2)
+    with pytest.raises(AssertionError):
+        assert_recovers(still, tmp_path)
+
+
+def test_lives_are_told_from_opacities() -> None:
+    """Of splats that are there from 0.25 to 0.75, of a case with such a truth."""
+    lives = torch.tensor([0.25, 0.75]).repeat(COUNT, 1)
+
+    class Told:
+        def instant(self, time: float) -> float:
+            return time
+
+        def at(self, time: float) -> Moment:
+            splats = canonical_splats()
+            seen = 3.0 if 0.25 <= time <= 0.75 else -9.0
+            return Moment(replace(splats, logit_opacities=splats.logit_opacities * 0 + seen))
+
+    found = lives_of(cast(Model, Told()))
+    torch.testing.assert_close(found, lives, atol=1e-6, rtol=0)
