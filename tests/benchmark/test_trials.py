@@ -186,10 +186,12 @@ def test_the_table_of_a_benchmark(tiny_scene: Path, finished: Path, tmp_path: Pa
     line = ["benchmark", "scenes", tiny_scene, "--out", out, "--steps", STEPS, "--seed", 1]
     done = gsdmsr(*line, "--preset", "static", "--preset", "dnerf", "--json")
     assert done.returncode == 0, done.stderr
+    folder = Trial(tiny_scene, "dnerf", STEPS, 1).folder(out)
+    assert f"trial 2 of 2: {folder}\n" in done.stderr
     document = json.loads(done.stdout)
     assert document == json.loads((out / "table.json").read_text(encoding="utf-8"))
     assert [row["preset"] for row in document["rows"]] == ["static", "dnerf"]
-    report = Trial(tiny_scene, "dnerf", STEPS, 1).folder(out) / "eval" / "metrics.json"
+    report = folder / "eval" / "metrics.json"
     scores = json.loads(report.read_text(encoding="utf-8"))["aggregate"]
     assert document["rows"][1]["psnr"] == scores["psnr"]
     assert f"| {scores['psnr']:.2f} |" in (out / "table.md").read_text(encoding="utf-8")

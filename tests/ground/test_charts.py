@@ -44,6 +44,13 @@ def test_the_corners_of_a_line_lie_where_the_ticks_say() -> None:
     assert float(texts["32"].get("y") or 0) - 4 == pytest.approx(y1)
 
 
+def test_texts_lie_inside_the_page() -> None:
+    chart = line_chart("t", "x", "y", [Line("a", [(0.0, 20.0), (8.0, 32.0)])])
+    for text in ElementTree.fromstring(chart).iter(f"{SVG}text"):
+        assert 0 <= float(text.get("x") or -1) <= WIDTH
+        assert 13 <= float(text.get("y") or -1) <= HEIGHT
+
+
 finite = st.floats(-1e6, 1e6, allow_nan=False)
 
 
@@ -64,6 +71,7 @@ def test_ticks_enclose_the_values_and_are_few(values: list[float]) -> None:
 
 
 def test_ticks_are_round() -> None:
+    assert _ticks([]) == [0, 0.2, 0.4, 0.6, 0.8, 1]
     assert _ticks([0, 8]) == [0, 2, 4, 6, 8]
     assert _ticks([20.3, 36.1]) == [20, 25, 30, 35, 40]
     assert _ticks([0.12, 0.17]) == [0.12, 0.13, 0.14, 0.15, 0.16, 0.17]

@@ -42,7 +42,7 @@ def test_a_film_goes_from_a_view_to_a_place_of_its_own(scene: Scene, tmp_path: P
     x, y, z = last.rotation @ OWN["look_at"] + last.translation
     assert abs(x) < 1e-9 and abs(y) < 1e-9 and z > 0
     assert last.rotation[1] @ [0, 0, 1] < 0  # y points down
-    assert (last.width, last.height) == (48, 48)
+    assert (last.width, last.height, last.cx, last.cy) == (48, 48, 24, 24)
 
 
 def test_a_field_of_view_is_that_of_the_height(scene: Scene, tmp_path: Path) -> None:
