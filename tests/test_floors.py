@@ -25,7 +25,7 @@ PLUGINS = (
 )  # fmt: skip
 """Folders of the package whose files are plug-ins."""
 
-EMPTY = ("model.layers", "training.losses")
+EMPTY = ("model.layers",)
 """Kinds of which no file comes with the package."""
 
 KERNELS = "ops/*/cpu.py", "ops/*/cpu/*.py", "backends/cpu/*.py"

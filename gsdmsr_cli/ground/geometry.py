@@ -52,6 +52,38 @@ def quat_to_rotmat(quats: Tensor) -> Tensor:
     return torch.stack(rows, -1).reshape(-1, 3, 3)
 
 
+def quat_product(first: Tensor, second: Tensor) -> Tensor:
+    """Return the Hamilton products of quaternions (..., 4) wxyz, which turn by ``second`` first."""
+    a, b, c, d = first.unbind(-1)
+    w, x, y, z = second.unbind(-1)
+    parts = [
+        a * w - b * x - c * y - d * z,
+        a * x + b * w + c * z - d * y,
+        a * y - b * z + c * w + d * x,
+        a * z + b * y - c * x + d * w,
+    ]
+    return torch.stack(parts, dim=-1)
+
+
+def nearest_quats(matrices: Tensor) -> Tensor:
+    """Return the unit quaternions (..., 4) of the rotations R with the largest trace of Rᵀ M.
+
+    Of M (..., 3, 3) = sum w y xᵀ that rotation takes x to y with the least sum of squares: the
+    eigenvector of the largest eigenvalue of a symmetric matrix (Horn 1987, section 4). Without a
+    gradient; the identity where M is 0.
+    """
+    (a, b, c), (d, e, f), (g, h, i) = (row.unbind(-1) for row in matrices.detach().unbind(-2))
+    rows = [
+        [a + e + i, h - f, c - g, d - b],
+        [h - f, a - e - i, b + d, c + g],
+        [c - g, b + d, e - a - i, f + h],
+        [d - b, c + g, f + h, i - a - e],
+    ]
+    largest = torch.linalg.eigh(torch.stack([torch.stack(row, -1) for row in rows], -2))[1][..., -1]
+    nowhere = (matrices == 0).all(dim=-1).all(dim=-1)[..., None]
+    return torch.where(nowhere, largest.new_tensor([1.0, 0.0, 0.0, 0.0]), largest)
+
+
 def scaled_axes(quats: Tensor, log_scales: Tensor) -> Tensor:
     """Return the (N, 3, 3) matrices R diag(exp(log_scales)), whose columns are axes [world units].
 

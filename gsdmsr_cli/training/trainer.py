@@ -210,7 +210,7 @@ class Trainer:
         if self.model.needs_jitter:
             jitter = float(torch.randn((), generator=self.generator))
         others = self.renderer.other_times(view.time, self._times, self.generator)
-        return Order(row, weights, jitter, others)
+        return Order(row, weights, jitter, others, self.renderer.seed(self.generator))
 
     def _penalty(self, order: Order, progress: float) -> Penalty | None:
         """Return the layers' regularisers, evaluated for one view, and their gradients."""

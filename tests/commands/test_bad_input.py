@@ -69,8 +69,8 @@ USAGE = {
     ),
     "an event that is no name": ("--set events=[3]", "events.*allowed: "),
     "unknown term of the loss": (
-        '--set losses.terms=[{"name":"flow"}]',
-        "unknown term of the loss 'flow'; known: none",
+        '--set losses.terms=[{"name":"rigidty"}]',
+        "unknown term of the loss 'rigidty'; did you mean 'rigidity'",
     ),
     "unknown layer": ('--set layers=[{"name":"fade"}]', "unknown layer 'fade'; known: none"),
     "no value": ("--set training.steps", "a.b=value"),

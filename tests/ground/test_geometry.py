@@ -10,9 +10,16 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.polynomial import Polynomial
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from gsdmsr_cli.ground.geometry import covariance, quat_to_rotmat, sh_basis
+from gsdmsr_cli.ground.geometry import (
+    covariance,
+    nearest_quats,
+    quat_product,
+    quat_to_rotmat,
+    sh_basis,
+)
 
 COMPONENT = st.floats(-1, 1, allow_subnormal=False)
 QUATS = st.tuples(COMPONENT, COMPONENT, COMPONENT, COMPONENT).filter(
@@ -114,3 +121,32 @@ def test_harmonics_follow_rodrigues_in_order_and_sign(degree: int) -> None:
 def test_unknown_degree_is_an_error(degree: int) -> None:
     with pytest.raises(ValueError, match="0 to 3"):
         sh_basis(tensor((0.0, 0.0, 1.0)), degree)
+
+
+def test_products_of_quaternions_turn_by_the_second_first() -> None:
+    quats = torch.randn(2, 5, 4, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    first, second = (Rotation.from_quat(part.numpy(), scalar_first=True) for part in quats)
+    found = quat_to_rotmat(quat_product(quats[0], quats[1]))
+    np.testing.assert_allclose(found, (first * second).as_matrix(), atol=1e-12)
+
+
+@settings(deadline=None)
+@given(QUATS, st.integers(0, 1000))
+def test_the_nearest_quaternion_is_the_rotation_that_fits(
+    quat: tuple[float, ...], seed: int
+) -> None:
+    rng = torch.Generator().manual_seed(seed)
+    before = torch.randn(3, 6, 3, dtype=torch.float64, generator=rng)
+    turn = quat_to_rotmat(tensor(quat))
+    after = before @ turn.mT
+    found = quat_to_rotmat(nearest_quats(after.mT @ before))
+    torch.testing.assert_close(found, turn.expand(3, 3, 3), atol=1e-6, rtol=0)
+    noisy = after + torch.randn(after.shape, dtype=torch.float64, generator=rng)
+    best = quat_to_rotmat(nearest_quats(noisy.mT @ before))
+    for one, x, y in zip(best, before, noisy, strict=True):
+        expected = Rotation.align_vectors(y.numpy(), x.numpy())[0].as_matrix()
+        np.testing.assert_allclose(one, expected, atol=1e-6)
+
+
+def test_the_nearest_quaternion_of_nothing_is_the_identity() -> None:
+    assert nearest_quats(torch.zeros(2, 3, 3)).tolist() == [[1, 0, 0, 0]] * 2

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from gsdmsr_cli.gaussians.splats import Splats
-from gsdmsr_cli.ground.geometry import quat_to_rotmat
+from gsdmsr_cli.ground.geometry import quat_product, quat_to_rotmat
 from gsdmsr_cli.ops.displace.twin import PARTS
 from gsdmsr_cli.ops.skin.cpu import SHORTEST
 
@@ -45,19 +45,6 @@ def skin_twin(
     return replace(
         splats,
         means=splats.means + moved,
-        quats=splats.quats + _product(turn, quats),
+        quats=splats.quats + quat_product(turn, quats),
         log_scales=splats.log_scales + growth,
     )
-
-
-def _product(first: Tensor, second: Tensor) -> Tensor:
-    """Return the Hamilton products of quaternions (N, 4) wxyz."""
-    a, b, c, d = first.unbind(1)
-    w, x, y, z = second.unbind(1)
-    parts = [
-        a * w - b * x - c * y - d * z,
-        a * x + b * w + c * z - d * y,
-        a * y - b * z + c * w + d * x,
-        a * z + b * y - c * x + d * w,
-    ]
-    return torch.stack(parts, dim=1)

@@ -31,12 +31,14 @@ class Order(NamedTuple):
         tile_weights: (tiles,) factors on the loss of each tile, or None for the whole picture.
         jitter: see ``Instant``.
         other_times: of each term of the loss, the second time that it wants, or None.
+        seed: of the random choices of terms of the loss; 0 where none makes any.
     """
 
     row: int
     tile_weights: Tensor | None = None
     jitter: float = 0.0
     other_times: tuple[float | None, ...] = ()
+    seed: int = 0
 
 
 @dataclass(frozen=True, eq=False)

@@ -114,7 +114,9 @@ class TrainingRenderer:
             if weight > 0:
                 then = None if other is None else moments[other]
                 moment = moments[instant]
-                seen = Seen(view, pictures, camera, target, frame, instant, moment, other, then)
+                seen = Seen(
+                    view, pictures, camera, target, frame, instant, moment, other, then, order.seed
+                )
                 loss = loss + weight * term(seen)
         return ViewGradients(
             loss.detach(), gradients_of(loss, model), found.on_screen,
@@ -126,6 +128,12 @@ class TrainingRenderer:
     ) -> tuple[float | None, ...]:
         """Return the second time that each term wants for a view, see ``Term.other_time``."""
         return tuple(term.other_time(time, times, generator) for term in self.terms)
+
+    def seed(self, generator: torch.Generator) -> int:
+        """Return the seed of the terms' random choices for a view, 0 if they make none."""
+        if not any(term.needs_seed for term in self.terms):
+            return 0
+        return int(torch.randint(2**62, (), generator=generator))
 
     def _moved(self, model: Model, instants: Sequence[Instant], phase: Phase) -> list[Moment]:
         """Return the model at each of the instants, the very same where these are equal."""

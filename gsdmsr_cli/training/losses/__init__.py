@@ -40,6 +40,7 @@ class Seen:
         instant, moment: when, and what was drawn.
         other_instant, other: the second instant that the term has chosen, and what the model is
             then; None unless it has an ``other_time``.
+        seed: of random choices, other for every view and step; 0 unless a term ``needs_seed``.
     """
 
     view: View
@@ -51,6 +52,7 @@ class Seen:
     moment: Moment
     other_instant: Instant | None = None
     other: Moment | None = None
+    seed: int = 0
 
 
 class Term(ABC):
@@ -58,9 +60,11 @@ class Term(ABC):
 
     Attributes:
         needs_depth: whether the frame is to have a depth.
+        needs_seed: whether it makes random choices, which follow from ``Seen.seed``.
     """
 
     needs_depth: ClassVar[bool] = False
+    needs_seed: ClassVar[bool] = False
 
     def weight(self, progress: float) -> float:
         """Return the factor of the term at ``progress`` in [0, 1]; with 0 it costs nothing."""

@@ -1,0 +1,53 @@
+"""Neighbourhoods move as rigidly as possible, whatever the rotations of their splats are.
+
+Sorkine & Alexa (SGP 2007), equation 3, as SC-GS (Huang et al., CVPR 2024, section 3.3) has it of
+control points; here of splats, so that it serves any motion, and in units of the squared distance
+between neighbours. The rotation of a neighbourhood is the best there is, by which the energy has no
+gradient.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from gsdmsr_cli.gaussians.splats import Splats
+from gsdmsr_cli.ground.geometry import nearest_quats, quat_to_rotmat
+from gsdmsr_cli.training.losses._comparing import any_time
+from gsdmsr_cli.training.losses._neighbours import (
+    Neighbourhoods,
+    NeighbourOptions,
+    NeighbourTerm,
+)
+
+
+@dataclass(frozen=True)
+class Options(NeighbourOptions):
+    """See ``Schedule`` and ``NeighbourOptions``."""
+
+
+class AsRigidAsPossible(NeighbourTerm):
+    """|(x_j - x_i) - R_i (x_j' - x_i')|^2, the prime being any train time."""
+
+    def other_time(
+        self, time: float, times: Sequence[float], generator: torch.Generator
+    ) -> float | None:
+        """Return any other train time."""
+        return any_time(time, times, generator)
+
+    def deviations(self, now: Splats, other: Splats, found: Neighbourhoods) -> Tensor:
+        """Return the squared lengths (S, K)."""
+        after, before = (found.apart(one.means) for one in (now, other))
+        with torch.no_grad():
+            weighted = found.weights[:, :, None] * after
+            turns = quat_to_rotmat(nearest_quats(weighted.mT @ before))
+        taken = before @ turns.mT
+        return (after - taken).square().sum(dim=2) / found.size.square()
+
+
+def start(options: Options) -> AsRigidAsPossible:
+    """Return the term."""
+    return AsRigidAsPossible(options)
