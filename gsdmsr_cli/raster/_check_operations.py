@@ -16,7 +16,7 @@ from torch import Tensor
 from gsdmsr_cli.gaussians.splats import Splats
 from gsdmsr_cli.ground.errors import GsdmsrError
 from gsdmsr_cli.ops import displace as deformation
-from gsdmsr_cli.ops import network, planes, precision
+from gsdmsr_cli.ops import hash_grid, network, planes, precision
 from gsdmsr_cli.ops import skin as skinning
 from gsdmsr_cli.ops.adam.cuda import Row, adam
 from gsdmsr_cli.ops.nearest import nearest_points
@@ -105,6 +105,17 @@ def _penalise(device: str, dtype: torch.dtype) -> Values:
     tensors = _grids(device, dtype)
     value = planes.penalty(_levels(tensors), 0.3, 0.7, 0.2)
     return _with_gradients(value, _GRID_NAMES, tensors)
+
+
+_HASH_LEVELS = hash_grid.Levels(((5, 4, 3), (17, 12, 9)), 128)
+"""One level with a row for each grid point, and one that has a hash."""
+
+
+def _look_up_hashed(device: str, dtype: torch.dtype) -> Values:
+    rows = _HASH_LEVELS.offsets[-1]
+    leaves = _leaves(device, dtype, _random(rows, 2), 0.7 * _random(_COUNT, 3, seed=1))
+    features = hash_grid.lookup(_HASH_LEVELS, *leaves)
+    return _with_gradients(features, ("the table", "points"), leaves)
 
 
 def _find_nearest(device: str, dtype: torch.dtype) -> Values:
@@ -203,6 +214,7 @@ OPERATIONS = {
         for name, dtype in _HALVES.items()
     },
     "the penalty of plane grids": _Operation(_penalise, FLOAT32),
+    "reading hash grids": _Operation(_look_up_hashed, FLOAT32),
     "the search for the nearest control points": _Operation(_find_nearest, 0.0),
     "the transforms of control points": _Operation(_transform, FLOAT32),
     "skinning splats": _Operation(_skin, FLOAT32),

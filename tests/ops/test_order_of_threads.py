@@ -18,8 +18,9 @@ from gsdmsr_cli.backends.cuda import compiler, launch
 from gsdmsr_cli.benchmark.cloud import camera, cloud
 from gsdmsr_cli.gaussians.moment import Moment
 from gsdmsr_cli.gaussians.splats import Splats
-from gsdmsr_cli.ops import planes
+from gsdmsr_cli.ops import hash_grid, planes
 from gsdmsr_cli.ops import skin as skinning
+from gsdmsr_cli.ops.hash_grid import cuda as hashed
 from gsdmsr_cli.ops.nearest import nearest_points
 from gsdmsr_cli.ops.planes import cuda as grids
 from gsdmsr_cli.raster import cuda
@@ -91,6 +92,14 @@ def looking_up(dtype: torch.dtype) -> list[Tensor]:
     return [features, value, *torch.autograd.grad(total, [points, *tensors])]
 
 
+def looking_up_hashed() -> list[Tensor]:
+    levels = hash_grid.Levels(((5, 4, 3), (17, 12, 9)), 128)
+    table = torch.randn(levels.offsets[-1], 2, generator=generator(2)).requires_grad_()
+    points = torch.randn(300, 3, generator=generator(3)).requires_grad_()
+    features = hashed.lookup(levels, table, points)
+    return [features, *torch.autograd.grad(features.square().sum(), [table, points])]
+
+
 def following() -> list[Tensor]:
     """Splats that follow control points, of which some are given no gradient."""
     splats, (points, log_radii, deformation) = splats_of(150), control_points_of(45)
@@ -113,6 +122,7 @@ WORKS: dict[str, Callable[[], list[Tensor]]] = {
     "L1 and SSIM": lambda: comparing(0.2),
     "control_points": following,
     "plane grids": lambda: looking_up(torch.float32),
+    "hash grids": looking_up_hashed,
     "plane grids in bf16": lambda: looking_up(torch.bfloat16),
     "plane grids in fp16": lambda: looking_up(torch.float16),
 }

@@ -23,6 +23,9 @@ MOST_VIEWS = 16
 MOST_LEVELS = 8
 """Levels of grids that one launch can look up."""
 
+MOST_HASH_LEVELS = 32
+"""Levels of a hash grid that one launch can look up."""
+
 MOST_TENSORS = 48
 """Tensors that one launch can move."""
 
@@ -55,7 +58,10 @@ def definitions() -> dict[str, str]:
     """Return the macros that every source is compiled with."""
     values = {name: f"{getattr(constants, name)!r}f" for name in _CONSTANTS}
     values["LOG2_ALPHA_MIN"] = f"{math.log2(constants.ALPHA_MIN)!r}f"
-    limits = {"MOST_VIEWS": MOST_VIEWS, "MOST_LEVELS": MOST_LEVELS, "MOST_TENSORS": MOST_TENSORS}
+    limits = {
+        "MOST_VIEWS": MOST_VIEWS, "MOST_LEVELS": MOST_LEVELS,
+        "MOST_HASH_LEVELS": MOST_HASH_LEVELS, "MOST_TENSORS": MOST_TENSORS,
+    }  # fmt: skip
     return values | {
         name: str(limit) for name, limit in ({"TILE": constants.TILE} | limits).items()
     }

@@ -43,6 +43,7 @@ __all__ = [
     "new_level",
     "penalty",
     "penalty_twin",
+    "to_cube",
 ]
 
 
