@@ -238,6 +238,8 @@ def test_a_missing_tensor_is_told(name: str) -> None:
         ("hexplane", "network.1.weight", (64, 48), r"shapes .*\(64, 48\).*, not one from 64 to 10"),
         ("hexplane", "network.2.bias", (9,), "a network of shapes .* to 10"),
         ("multiscale", "coarse_decoder.0.weight", (32, 3), "a network .* from 16 to 3"),
+        ("hash_grids", "time.1", (5, 2), r"a table of shape \(5, 2\), not .*, for a hash grid"),
+        ("hash_grids", "encoder.0.weight", (32, 64), "a network .* from 48 to 64"),
         ("multiscale", "embeddings", (8, 16), r"\(8, 16\) .* for 'embeddings', not \(9, 16\)"),
         ("multiscale", "embeddings", (9, 32), r"\(9, 32\) .* for 'embeddings', not \(9, 16\)"),
         ("control_points", "log_radii", (1023,), r"\(1024, 3\) control points, 1023 radii"),

@@ -37,6 +37,17 @@ CASES = {
     "multiscale": Case(
         {"name": "multiscale", "coarse_until": 0.0, "time_ratio": 0.5}, moved(each_its_own_way)
     ),
+    "hash_grids": Case(
+        {
+            "name": "hash_grids",
+            "space_resolutions": [2, 8],
+            "plane_resolutions": [2, 8],
+            "time_resolutions": [4, 8],
+            "width": 32,
+            "smoothness": 0.01,
+        },
+        moved(each_its_own_way),
+    ),
 }
 """By the names of the motions; each has the trajectory that the motion is made for."""
 

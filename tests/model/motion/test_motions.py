@@ -33,6 +33,8 @@ from gsdmsr_cli.ground.errors import UsageError
 from gsdmsr_cli.model import motion as motions
 from gsdmsr_cli.model.layer import Facts, Instant, Layer, options_of
 from gsdmsr_cli.model.motion.multiscale import SMOOTH_ROWS
+from gsdmsr_cli.ops import hash_grid
+from gsdmsr_cli.ops.hash_grid import lookup_twin as lookup_hashed_twin
 from gsdmsr_cli.ops.planes import CUBE, Level, lookup_twin, penalty_twin
 from gsdmsr_cli.training.rates import NAMED
 
@@ -410,6 +412,68 @@ def test_multiscale_as_in_the_method_holds_nothing_per_splat() -> None:
     assert_equal(moved_by(motion, splats.take(rows), 0.3), expected, atol=1e-6, rtol=1e-6)
 
 
+def hash_grids_of(tensors: Mapping[str, Tensor], places: Tensor, time: float) -> Tensor:
+    """Return the gated features of the defaults' grids, in float64, of places in the cube."""
+    space = hash_grid.new_levels([16] * 3, [256] * 3, 8, 15)
+    planes_and_time = hash_grid.new_levels([8, 8, 8], [32, 32, 16], 8, 15)
+    static = lookup_hashed_twin(space, tensors["space"].detach().double(), places)
+    when = places.new_full((len(places), 1), 0.9 * (2 * time - 1))
+    x, y, z = places.split(1, dim=1)
+    temporal = [
+        lookup_hashed_twin(
+            planes_and_time, tensors[f"time.{i}"].detach().double(), torch.cat([*axes, when], dim=1)
+        )
+        for i, axes in enumerate(((x, y), (x, z), (y, z)))
+    ]
+    score = 2 * decoded(static, exact(tensors, "gate")).sigmoid() - 1
+    return score * decoded(torch.cat(temporal, dim=1), exact(tensors, "encoder")).relu()
+
+
+def in_cube(means: Tensor) -> Tensor:
+    """Return where means are in the box of ``FACTS``, from -1 to 1, in float64."""
+    lower, upper = (means.new_tensor(corner).double() for corner in FACTS.box)
+    return 2 * (means.double() - lower) / (upper - lower) - 1
+
+
+@pytest.mark.parametrize("time", [0.0, 0.3, 1.0])
+def test_hash_grids_are_their_formula(time: float) -> None:
+    """Offsets decoded from (2 s(xyz) - 1) relu(g(xyt, xzt, yzt)), of t over 0.9 of the grids."""
+    splats, motion = splats_of(COUNT), disturbed(started("hash_grids"))
+    gated = hash_grids_of(motion.tensors(), in_cube(splats.means), time)
+    parts = decoded(gated, exact(motion.tensors(), "decoder")).split([3, 4, 3], dim=1)
+    found = moved_by(motion, splats, time)
+    for name, change in zip(("means", "quats", "log_scales"), parts, strict=True):
+        moved = found.tensors()[name].double() - splats.tensors()[name]
+        torch.testing.assert_close(moved, change, rtol=1e-3, atol=1e-4, msg=name)
+        assert change.abs().max() > 0.01
+
+
+def test_hash_grids_are_smooth_in_space_and_time() -> None:
+    """The mean squared difference of gated features at a share of the splats and beside them."""
+    options = {"smoothness": 3.0, "share": 0.5, "reach": 0.03, "time_reach": 0.02}
+    splats, motion = splats_of(COUNT), disturbed(started("hash_grids", COUNT, **options))
+    found = penalty_of(motion, splats, 0.6, generator(7))
+    source = generator(7)
+    means = splats.means[torch.randint(COUNT, (4,), generator=source)]
+    offsets = 2 * torch.rand(4, 4, generator=source) - 1
+    beside = means + 0.03 * FACTS.bound * offsets[:, :3]
+    squares = []
+    for mean, other, offset in zip(means, beside, offsets.double(), strict=True):
+        here = hash_grids_of(motion.tensors(), in_cube(mean[None]), 0.6)
+        there = hash_grids_of(motion.tensors(), in_cube(other[None]), 0.6 + 0.02 * float(offset[3]))
+        squares.append((here - there).square().mean())
+    assert found is not None
+    torch.testing.assert_close(found.double(), 3 * torch.stack(squares).mean(), rtol=5e-3, atol=0)
+    off = disturbed(started("hash_grids", COUNT, smoothness=0.0))
+    assert penalty_of(off, splats, 0.6, generator(7)) is None
+
+
+def test_hash_grids_give_positions_no_gradient() -> None:
+    splats = splats_of(COUNT).map(torch.nn.Parameter)
+    moved_by(disturbed(started("hash_grids")), splats, 0.3).means.sum().backward()
+    assert torch.equal(splats.means.grad, torch.ones_like(splats.means))
+
+
 def trained_within(value: object) -> list[Tensor]:
     """Return all trained leaves that an object holds, also those in lists and tuples."""
     if isinstance(value, Tensor):
@@ -444,6 +508,16 @@ def test_all_that_is_trained_goes_where_the_model_goes(name: str, options: dict[
         ("multiscale", "coarse_channels", 24, "a multiple of 16, 16 or more"),
         ("multiscale", "embedding", -16, "a multiple of 16, 0 or more"),
         ("multiscale", "embedding", 8, "a multiple of 16, 0 or more"),
+        ("hash_grids", "space_levels", 0, "1 to 32"),
+        ("hash_grids", "time_levels", 48, "1 to 32"),
+        ("hash_grids", "time_levels", 9, "times features a multiple of 16"),
+        ("hash_grids", "features", 9, "1 to 8"),
+        ("hash_grids", "space_resolutions", [1, 16], r"\[first, last\], the first 2 or more"),
+        ("hash_grids", "time_resolutions", [8, 4], r"\[first, last\], the first 2 or more"),
+        ("hash_grids", "log2_rows", 25, "4 to 24"),
+        ("hash_grids", "rate", [0, 1], r"\[start, end\], both above 0"),
+        ("hash_grids", "reach", -1, "0 or more"),
+        ("hash_grids", "share", 0, "above 0, at most 1"),
     ],
 )
 def test_sizes_that_no_kernel_serves_are_refused(
