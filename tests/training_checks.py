@@ -1,7 +1,11 @@
-"""A short training on the tiny scene, for tests of the trainer, its loop and its run folder."""
+"""A short training on the tiny scene, for tests of the trainer, its loop and its run folder.
+
+And a run that has made no step, for tests of commands that take one.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import torch
@@ -44,6 +48,22 @@ def trainer_of(data: Path, preset: Preset, engine: Engine | None = None) -> Trai
 
 def run_of(trainer: Trainer, root: Path) -> Run:
     return create_run(root, "dnerf", trainer.preset, trainer.facts, trainer.scene)
+
+
+def begun_run(
+    data: Path,
+    root: Path,
+    options: Sequence[str],
+    preset: str = "dnerf",
+    reason: str | None = None,
+    verify: bool = False,
+) -> Run:
+    """Make a run that has made no step."""
+    trainer = trainer_of(data, load_preset(preset, None, options))
+    about = trainer.preset, trainer.facts, trainer.scene
+    run = create_run(root, preset, *about, reason=reason, verify=verify)
+    run.save(trainer.checkpoint())
+    return run
 
 
 def copies(tensors: dict[str, Tensor]) -> dict[str, Tensor]:

@@ -13,18 +13,15 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from training_checks import begun_run
 
 from gsdmsr_cli.commands import render as render_command
 from gsdmsr_cli.commands import train as train_command
-from gsdmsr_cli.formats import read_scene
 from gsdmsr_cli.ground.errors import DataError
 from gsdmsr_cli.ground.locks import one_of_readers, sole_writer
 from gsdmsr_cli.options.preset import load_preset
-from gsdmsr_cli.raster import best_engine
 from gsdmsr_cli.runs import run as runs
-from gsdmsr_cli.runs.run import Run, create_run, open_run, open_with_model
-from gsdmsr_cli.scene.pictures import Pictures
-from gsdmsr_cli.training.trainer import Trainer
+from gsdmsr_cli.runs.run import Run, open_run, open_with_model
 
 FEW = ("splats.count=50", "splats.start=box", "motion={name: static}", "training.views_per_step=1")
 Gsdmsr = Callable[..., int]
@@ -35,11 +32,7 @@ pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="folders cannot 
 @pytest.fixture(scope="module")
 def trained(tiny_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run that has made no step."""
-    scene, preset = read_scene(tiny_scene), load_preset("dnerf", None, FEW)
-    trainer = Trainer(scene, preset, best_engine("cpu"), Pictures((1.0, 1.0, 1.0), 1, 1 << 28))
-    made = create_run(tmp_path_factory.mktemp("once") / "run", "x", preset, trainer.facts, scene)
-    made.save(trainer.checkpoint())
-    return made.root
+    return begun_run(tiny_scene, tmp_path_factory.mktemp("once") / "run", FEW).root
 
 
 @pytest.fixture

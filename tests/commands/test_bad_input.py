@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 import torch
 from datasets import noise, write_picture
+from training_checks import begun_run, run_of, trainer_of
 
 from gsdmsr_cli.commands import _beginning
 from gsdmsr_cli.commands import train as train_command
@@ -25,12 +26,9 @@ from gsdmsr_cli.formats import read_scene
 from gsdmsr_cli.ground import files, locks
 from gsdmsr_cli.ground.errors import DataError, UsageError
 from gsdmsr_cli.options.preset import load_preset
-from gsdmsr_cli.raster import best_engine
 from gsdmsr_cli.runs import checkpoints
 from gsdmsr_cli.runs.run import Run, continue_run, create_run, open_run, refuse_used
 from gsdmsr_cli.scene import imaging
-from gsdmsr_cli.scene.pictures import Pictures
-from gsdmsr_cli.training.trainer import Trainer
 
 Gsdmsr = Callable[..., int]
 
@@ -40,11 +38,7 @@ FEW = ("splats.count=20", "splats.start=box", "motion={name: static}")
 @pytest.fixture
 def run(tiny_scene: Path, tmp_path: Path) -> Run:
     """A run that has made no step."""
-    scene, preset = read_scene(tiny_scene), load_preset("dnerf", None, FEW)
-    trainer = Trainer(scene, preset, best_engine("cpu"), Pictures((1.0, 1.0, 1.0), 1, 1 << 28))
-    made = create_run(tmp_path / "a [b] [/x] :smile:", "dnerf", preset, trainer.facts, scene)
-    made.save(trainer.checkpoint())
-    return made
+    return begun_run(tiny_scene, tmp_path / "a [b] [/x] :smile:", FEW)
 
 
 def one_line(capsys: pytest.CaptureFixture[str]) -> str:
@@ -137,9 +131,8 @@ def test_a_run_of_half_precision_is_drawn_on_the_cpu_but_not_trained_there(
 ) -> None:
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     options = "splats.count=20", "splats.start=box", "training.precision=bf16"
-    scene, preset = read_scene(tiny_scene), load_preset("dnerf", None, options)
-    trainer = Trainer(scene, preset, best_engine("cpu"), Pictures((1.0, 1.0, 1.0), 1, 1 << 28))
-    made = create_run(tmp_path / "run", "dnerf", preset, trainer.facts, scene)
+    trainer = trainer_of(tiny_scene, load_preset("dnerf", None, options))
+    made = run_of(trainer, tmp_path / "run")
     made.save(trainer.checkpoint())
     before = {path: path.read_bytes() for path in made.root.iterdir()}
     assert gsdmsr("train", "--data", tiny_scene, "--out", made.root, "--resume") == 2
@@ -149,7 +142,7 @@ def test_a_run_of_half_precision_is_drawn_on_the_cpu_but_not_trained_there(
         renderer = trained.renderer
     trainer.restore(made.load())
     assert renderer.model.precision == trainer.model.precision == "bf16"
-    view = scene.split("test")[0]
+    view = trainer.scene.split("test")[0]
     frame = draw(renderer.model, view.camera, view.time, renderer.engine, renderer.background)
     assert frame.rgb.isfinite().all()
 

@@ -10,13 +10,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from training_checks import begun_run
 
 from gsdmsr_cli.formats import read_scene
-from gsdmsr_cli.options.preset import load_preset
-from gsdmsr_cli.raster import best_engine
-from gsdmsr_cli.runs.run import Run, create_run, open_run
-from gsdmsr_cli.scene.pictures import Pictures
-from gsdmsr_cli.training.trainer import Trainer
+from gsdmsr_cli.runs.run import Run, open_run
 
 FEW = ("splats.count=50", "splats.start=box", "motion={name: static}", "training.views_per_step=1")
 Gsdmsr = Callable[..., int]
@@ -26,11 +23,8 @@ Gsdmsr = Callable[..., int]
 def begun(tiny_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with a copy of the data and a run on it that has made no step."""
     root = tmp_path_factory.mktemp("changed")
-    scene = read_scene(Path(shutil.copytree(tiny_scene, root / "data")))
-    preset = load_preset("dnerf", None, FEW)
-    trainer = Trainer(scene, preset, best_engine("cpu"), Pictures((1.0, 1.0, 1.0), 1, 1 << 28))
-    made = create_run(root / "run", "x", preset, trainer.facts, scene, verify=True)
-    made.save(trainer.checkpoint())
+    data = Path(shutil.copytree(tiny_scene, root / "data"))
+    begun_run(data, root / "run", FEW, verify=True)
     return root
 
 

@@ -11,18 +11,13 @@ from typing import Any
 import pytest
 from datasets import write_json
 from reports import small_report
+from training_checks import begun_run
 
 from gsdmsr_cli.commands import compare
 from gsdmsr_cli.commands import eval as evaluate
 from gsdmsr_cli.evaluation import speed
-from gsdmsr_cli.formats import read_scene
 from gsdmsr_cli.ground import say
 from gsdmsr_cli.ground.errors import DataError, UsageError
-from gsdmsr_cli.options.preset import load_preset
-from gsdmsr_cli.raster import best_engine
-from gsdmsr_cli.runs.run import create_run
-from gsdmsr_cli.scene.pictures import Pictures
-from gsdmsr_cli.training.trainer import Trainer
 
 Capture = pytest.CaptureFixture[str]
 
@@ -82,12 +77,8 @@ def runs(tiny_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> list[Pat
         patch.setenv("TORCH_HOME", str(tmp_path_factory.mktemp("torch")))
         for count in (40, 400):
             options = [f"splats.count={count}", "training.threads=1"]
-            scene, preset = read_scene(tiny_scene), load_preset("static", None, options)
-            pictures = Pictures((1.0, 1.0, 1.0), 1, 1 << 24)
-            trainer = Trainer(scene, preset, best_engine("cpu"), pictures)
             folder = tmp_path_factory.mktemp("runs") / f"<{count}>"
-            run = create_run(folder, "static", preset, trainer.facts, scene)
-            run.save(trainer.checkpoint())
+            begun_run(tiny_scene, folder, options, preset="static")
             evaluate.run(folder)
             folders.append(folder)
     return folders

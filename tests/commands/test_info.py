@@ -12,19 +12,15 @@ import pytest
 import torch
 from datasets import noise, write_dnerf, write_json, write_picture
 from reports import small_report
+from training_checks import begun_run
 
 from gsdmsr_cli.commands import info
 from gsdmsr_cli.exports._ply import write_ply
-from gsdmsr_cli.formats import read_scene
 from gsdmsr_cli.gaussians.splats import Splats
 from gsdmsr_cli.ground import say
 from gsdmsr_cli.ground.errors import DataError
-from gsdmsr_cli.options.preset import load_preset
-from gsdmsr_cli.raster import best_engine
-from gsdmsr_cli.runs.run import Run, create_run
+from gsdmsr_cli.runs.run import Run
 from gsdmsr_cli.scene.native import cv2
-from gsdmsr_cli.scene.pictures import Pictures
-from gsdmsr_cli.training.trainer import Trainer
 
 Capture = pytest.CaptureFixture[str]
 
@@ -93,11 +89,8 @@ def test_a_rig_whose_videos_are_not_decoded_is_left_as_it_is(
 def run(tiny_scene: Path, tmp_path: Path) -> Run:
     """A run that has just begun."""
     data = Path(shutil.copytree(tiny_scene, tmp_path / "data"))
-    scene = read_scene(data)
-    preset = load_preset("dnerf", None, ["splats.count=60", "training.threads=1"])
-    trainer = Trainer(scene, preset, best_engine("cpu"), Pictures((1.0,) * 3, 1, 1 << 24))
-    made = create_run(tmp_path / "run", "dnerf", preset, trainer.facts, scene, False, "why")
-    made.save(trainer.checkpoint())
+    options = "splats.count=60", "training.threads=1"
+    made = begun_run(data, tmp_path / "run", options, reason="why")
     made.log({"step": 0, "val_psnr": 12.5})
     return made
 

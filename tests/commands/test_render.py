@@ -18,18 +18,14 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from training_checks import begun_run
 
 from gsdmsr_cli.cli.main import main
 from gsdmsr_cli.filming import buffers as drawn_buffers
 from gsdmsr_cli.filming import draw_film
-from gsdmsr_cli.formats import read_scene
-from gsdmsr_cli.options.preset import load_preset
-from gsdmsr_cli.raster import best_engine
-from gsdmsr_cli.runs.run import create_run, open_run
+from gsdmsr_cli.runs.run import open_run
 from gsdmsr_cli.scene.imaging import image_size, read_exr, read_image
 from gsdmsr_cli.scene.native import load_av
-from gsdmsr_cli.scene.pictures import Pictures
-from gsdmsr_cli.training.trainer import Trainer
 
 Render = Callable[..., int]
 
@@ -39,11 +35,7 @@ FEW = ("splats.count=200", "splats.start=box", "splats.opacity=0.5", "motion={na
 @pytest.fixture(scope="module")
 def run(tiny_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run that has made no step."""
-    scene, preset = read_scene(tiny_scene), load_preset("dnerf", None, FEW)
-    trainer = Trainer(scene, preset, best_engine("cpu"), Pictures((1.0, 1.0, 1.0), 1, 1 << 28))
-    made = create_run(tmp_path_factory.mktemp("render") / "run", "x", preset, trainer.facts, scene)
-    made.save(trainer.checkpoint())
-    return made.root
+    return begun_run(tiny_scene, tmp_path_factory.mktemp("render") / "run", FEW).root
 
 
 @pytest.fixture

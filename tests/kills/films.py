@@ -5,15 +5,11 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from gsdmsr_cli.formats import read_scene
+from training_checks import begun_run
+
 from gsdmsr_cli.ground.files import leftovers
-from gsdmsr_cli.options.preset import load_preset
-from gsdmsr_cli.raster import best_engine
-from gsdmsr_cli.runs.run import create_run
 from gsdmsr_cli.scene.imaging import read_exr, read_image
 from gsdmsr_cli.scene.native import load_av
-from gsdmsr_cli.scene.pictures import Pictures
-from gsdmsr_cli.training.trainer import Trainer
 
 Shown = dict[str, object]
 
@@ -25,11 +21,7 @@ _FEW = ("splats.count=200", "splats.start=box", "splats.opacity=0.5", "motion={n
 
 def make_run(data: Path, folder: Path) -> Path:
     """Make a run that has made no step, and return its folder."""
-    scene, preset = read_scene(data), load_preset("dnerf", None, _FEW)
-    trainer = Trainer(scene, preset, best_engine("cpu"), Pictures((1.0, 1.0, 1.0), 1, 1 << 28))
-    made = create_run(folder, "x", preset, trainer.facts, scene)
-    made.save(trainer.checkpoint())
-    return made.root
+    return begun_run(data, folder, _FEW).root
 
 
 def shown(folder: Path) -> Shown:
