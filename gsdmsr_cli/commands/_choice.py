@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 from gsdmsr_cli.formats import suited_preset
@@ -38,10 +39,9 @@ class Choice:
         Raises:
             UsageError: an option does not exist or is out of range.
         """
-        options = load_preset(self.preset, self.config, self.overrides)
         if self.named:
-            check_plugins(options)
-        return options
+            check_plugins(self._given)
+        return self._given
 
     def suit(self, scene: Scene) -> Chosen:
         """Return the options of a training on ``scene``.
@@ -50,13 +50,16 @@ class Choice:
             UsageError: an option does not exist or is out of range.
         """
         if self.named:
-            options = load_preset(self.preset, self.config, self.overrides)
-            return Chosen(options, self.preset or self._file or "default", None)
+            return Chosen(self._given, self.preset or self._file or "default", None)
         suited = suited_preset(scene)
         options = load_preset(suited.name, self.config, self.overrides)
         check_plugins(options)
         reason = f"preset {suited.name}, since {suited.reason}"
         return Chosen(options, self._file or suited.name, reason)
+
+    @cached_property
+    def _given(self) -> Preset:
+        return load_preset(self.preset, self.config, self.overrides)
 
     @property
     def _file(self) -> str | None:
