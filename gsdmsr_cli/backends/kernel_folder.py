@@ -35,8 +35,8 @@ def _temporary(elsewhere: str) -> Path:
         ) from error
     atexit.register(_remove, folder, os.getpid())
     say.warn(
-        f"warning: compiled kernels cannot be kept in {elsewhere}, so every command compiles them "
-        f"anew, which takes about a minute; {remedy}"
+        f"compiled kernels cannot be kept in {elsewhere}, so every command compiles them anew, "
+        f"which takes about a minute; {remedy}"
     )
     return folder
 

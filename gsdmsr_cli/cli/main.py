@@ -132,7 +132,7 @@ def _call() -> int:
 
 def _tell(message: str, code: int) -> None:
     line = one_line(message)
-    say.warn(f"error: {line}")
+    say.error(line)
     say.answer_with_error(_KINDS.get(code, _KINDS[1]), line, code)
 
 

@@ -99,7 +99,7 @@ class Resumed:
         self.name, self.reason = self._earlier.name, self._earlier.reason
         self._checkpoint, damage = self._earlier.load_whole()
         if damage:
-            say.warn(f"warning: {damage}")
+            say.warn(damage)
         self._require_rest()
 
     def _require_rest(self) -> None:

@@ -99,7 +99,7 @@ def _harmless(name: str, otherwise: Callable[[], object] = lambda: None) -> Iter
     try:
         yield
     except Exception as error:  # whatever others raise: it must not end a training
-        say.warn(f"warning: {name} is left out from here on: {type(error).__name__}: {error}")
+        say.warn(f"{name} is left out from here on: {type(error).__name__}: {error}")
         otherwise()
 
 

@@ -48,7 +48,7 @@ def run(paths: Sequence[Path], out: Path | None, data: Path | None) -> None:
     for one in compared[1:]:
         if one.differs:
             differs = ", ".join(one.differs)
-            say.warn(f"warning: {one.name} was measured otherwise than {names[0]}: {differs}")
+            say.warn(f"{one.name} was measured otherwise than {names[0]}: {differs}")
     if out is not None:
         folders = dict(zip(names, paths, strict=True))
         frames = _side_by_side(compared, folders, data)

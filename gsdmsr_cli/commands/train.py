@@ -80,7 +80,7 @@ def _train(
         timings = {"load_s": load_s, "compile_s": _start_work(trainer, device)}
         processes, began = len(trainer.workers), trainer.clock.step
         with TrainingDisplay() as display, observing(observers, folder, began) as hand_on:
-            finished = train(trainer, folder, _both(display.show, hand_on), _warn)
+            finished = train(trainer, folder, _both(display.show, hand_on), say.warn)
     account = _write_account(folder, trainer, device, timings, processes)
     _say_end(folder, trainer, request.data, finished)
     if not finished:
@@ -185,11 +185,7 @@ def _warn_of_memory(scene: Scene, options: Preset, device: str) -> None:
     expected = memory.estimate(scene.split("train"), options, processes)
     text = memory.warning(expected, limits.available_memory())
     if text is not None:
-        _warn(text)
-
-
-def _warn(text: str) -> None:
-    say.warn(f"warning: {text}")
+        say.warn(text)
 
 
 def _say_end(folder: Run, trainer: Trainer, data: Path, finished: bool) -> None:

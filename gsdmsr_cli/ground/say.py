@@ -95,9 +95,14 @@ def log_to(path: Path) -> None:
         raise UsageError(f"--log-file {path}: cannot be written: {reason}") from error
 
 
+def error(text: str) -> None:
+    """Say what has ended the command, even where quiet is wanted."""
+    _say(f"error: {text}", WARNINGS)
+
+
 def warn(text: str) -> None:
-    """Say what nobody must miss, such as an error, even where quiet is wanted."""
-    _say(text, WARNINGS)
+    """Say what nobody must miss, even where quiet is wanted."""
+    _say(f"warning: {text}", WARNINGS)
 
 
 def note(text: str) -> None:
@@ -125,9 +130,9 @@ def write_log(text: str) -> None:
     try:
         print(f"{datetime.now().astimezone().isoformat(timespec='milliseconds')} {text}",
               file=_manner.log, flush=True)  # fmt: skip
-    except OSError as error:
+    except OSError as refused:
         _manner.log = None
-        print(f"warning: --log-file cannot be written: {error.strerror}", file=sys.stderr)
+        warn(f"--log-file cannot be written: {refused.strerror}")
 
 
 def result(document: Mapping[str, Any], *shown: RenderableType, width: int | None = None) -> None:

@@ -53,10 +53,10 @@ def talkative(gsdmsr: Gsdmsr) -> Gsdmsr:
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        ("", ["a note", "a warning"]),
-        ("-q", ["a warning"]),
-        ("--quiet", ["a warning"]),
-        ("--verbose", ["a detail", "a note", "a warning"]),
+        ("", ["a note", "warning: a warning"]),
+        ("-q", ["warning: a warning"]),
+        ("--quiet", ["warning: a warning"]),
+        ("--verbose", ["a detail", "a note", "warning: a warning"]),
     ],
 )
 def test_stderr_says_as_much_as_is_wanted(
@@ -66,7 +66,7 @@ def test_stderr_says_as_much_as_is_wanted(
     out, err = capsys.readouterr()
     assert (out, err.splitlines()) == ("a is 1\n", said)
     assert talkative("doctor") == 0  # what one command was told does not hold for the next
-    assert capsys.readouterr().err.splitlines() == ["a note", "a warning"]
+    assert capsys.readouterr().err.splitlines() == ["a note", "warning: a warning"]
 
 
 @pytest.mark.parametrize("command", ["doctor", "render r", "train --data d --out r", "demo"])
@@ -112,8 +112,8 @@ def test_the_log_file_gets_what_stderr_gets_with_times(
     stamp = r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d\.\d{3}[+-]\d\d:\d\d "
     assert all(re.match(stamp, line) for line in lines)
     texts = [re.sub(stamp, "", line) for line in lines]
-    assert texts[:2] == ["a note", "a warning"]
-    assert texts[2:] == ["a note", "a warning", "error: no such thing"]
+    assert texts[:2] == ["a note", "warning: a warning"]
+    assert texts[2:] == ["a note", "warning: a warning", "error: no such thing"]
 
 
 def test_a_log_file_that_cannot_be_written_is_refused(
