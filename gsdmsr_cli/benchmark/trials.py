@@ -21,6 +21,7 @@ from gsdmsr_cli.ground.files import read_json
 from gsdmsr_cli.ground.limits import cores
 from gsdmsr_cli.options.preset import Preset, load_preset
 from gsdmsr_cli.runs.checkpoints import Checkpoint
+from gsdmsr_cli.runs.outputs import EVALUATION, METRICS
 from gsdmsr_cli.runs.run import Run, is_run, open_run
 
 
@@ -156,7 +157,7 @@ def _report(trial: Trial, root: Path) -> dict[str, Any]:
 
 
 def _report_path(trial: Trial, root: Path) -> Path:
-    return trial.folder(root) / "eval" / "metrics.json"
+    return trial.folder(root) / EVALUATION / METRICS
 
 
 def _left_to_do(trial: Trial, root: Path, terms: Terms) -> Iterator[Line]:

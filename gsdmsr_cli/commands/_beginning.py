@@ -14,7 +14,8 @@ from gsdmsr_cli.ground.errors import UsageError
 from gsdmsr_cli.ground.locks import sole_writer
 from gsdmsr_cli.options import strict
 from gsdmsr_cli.options.preset import Preset, load_preset
-from gsdmsr_cli.runs.run import OUTPUTS, Run, continue_run, create_run, open_run, refuse_used
+from gsdmsr_cli.runs.outputs import OUTPUTS
+from gsdmsr_cli.runs.run import Run, continue_run, create_run, open_run, refuse_used
 from gsdmsr_cli.runs.seen_pictures import check_whole
 from gsdmsr_cli.scene.scene import Scene
 from gsdmsr_cli.training.request import Request

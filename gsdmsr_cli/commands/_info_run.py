@@ -6,10 +6,10 @@ from pathlib import Path
 from typing import Any
 
 from gsdmsr_cli.commands._found import Found
-from gsdmsr_cli.commands._results import EVALUATION, METRICS
 from gsdmsr_cli.evaluation import protocol
 from gsdmsr_cli.formats import needs_preparing, read_scene
 from gsdmsr_cli.ground.errors import DataError
+from gsdmsr_cli.runs.outputs import EVALUATION, METRICS
 from gsdmsr_cli.runs.run import Run, open_run
 
 

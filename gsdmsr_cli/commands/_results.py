@@ -1,4 +1,4 @@
-"""What eval and render write into a run folder, and its removal when the run is replaced."""
+"""Removes what eval and render have written into a run folder when the run is replaced."""
 
 from __future__ import annotations
 
@@ -7,15 +7,7 @@ from pathlib import Path
 from gsdmsr_cli.filming.output_files import remove_films
 from gsdmsr_cli.ground.errors import DataError
 from gsdmsr_cli.ground.files import read_json, remove_if_empty, remove_leftovers
-from gsdmsr_cli.runs.run import OUTPUTS
-
-EVALUATION, FILMS = OUTPUTS
-"""Names of their folders."""
-
-METRICS = "metrics.json"
-"""The file of figures that eval writes, which tells whose the report beside it is."""
-
-REPORTS = "report.md", "report.html"
+from gsdmsr_cli.runs.outputs import EVALUATION, FILMS, METRICS, REPORTS
 
 
 def remove_results(run_folder: Path) -> None:

@@ -9,7 +9,6 @@ from rich.markup import escape
 from rich.table import Table
 
 from gsdmsr_cli.commands._progress import progress_bar
-from gsdmsr_cli.commands._results import EVALUATION, METRICS
 from gsdmsr_cli.commands._trained import open_trained
 from gsdmsr_cli.evaluation.comparison import Compared, compare, most_disputed, rows_of
 from gsdmsr_cli.evaluation.gates import read_report
@@ -19,6 +18,7 @@ from gsdmsr_cli.ground.errors import DataError, UsageError
 from gsdmsr_cli.ground.files import write_text
 from gsdmsr_cli.reporting.comparison import SideBySide, comparison_page
 from gsdmsr_cli.reporting.frames import data_url, drawn_and_true
+from gsdmsr_cli.runs.outputs import EVALUATION, METRICS
 from gsdmsr_cli.scene.imaging import eight_bits
 from gsdmsr_cli.scene.scene import View
 

@@ -14,6 +14,7 @@ from gsdmsr_cli.filming.request import Request as FilmRequest
 from gsdmsr_cli.ground import say
 from gsdmsr_cli.ground.errors import DataError, UsageError
 from gsdmsr_cli.ground.locks import sole_writer
+from gsdmsr_cli.runs.outputs import EVALUATION, METRICS, REPORTS
 from gsdmsr_cli.training.request import Request
 
 BUDGET = "60s"
@@ -66,8 +67,8 @@ def _places(scene: Path, run_folder: Path) -> list[tuple[str, str]]:
     """Return what there is to look at, and where."""
     places = [("the pictures it was trained on", scene / "train")]
     places += [("video", path) for path in sorted(run_folder.rglob("*.webm"))]
-    places += [("scores", run_folder / "eval" / "metrics.json")]
-    places += [("report, for a browser", run_folder / "eval" / "report.html")]
+    places += [("scores", run_folder / EVALUATION / METRICS)]
+    places += [("report, for a browser", run_folder / EVALUATION / REPORTS[1])]
     return [(what, str(path)) for what, path in places]
 
 

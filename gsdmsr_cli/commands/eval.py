@@ -11,7 +11,6 @@ from rich.markup import escape
 from rich.table import Table
 
 from gsdmsr_cli.commands._measure import describe, measure
-from gsdmsr_cli.commands._results import EVALUATION, METRICS, REPORTS
 from gsdmsr_cli.commands._trained import Trained, open_trained
 from gsdmsr_cli.evaluation import summary
 from gsdmsr_cli.evaluation.gates import Verdict, read_gates
@@ -25,6 +24,7 @@ from gsdmsr_cli.ground.files import require_folder, write_json, write_text
 from gsdmsr_cli.ground.locks import sole_writer
 from gsdmsr_cli.reporting.frames import make_report_frames
 from gsdmsr_cli.reporting.page import page
+from gsdmsr_cli.runs.outputs import EVALUATION, METRICS, REPORTS
 
 SUMMARY_VARIABLE = "GITHUB_STEP_SUMMARY"
 """Environment variable in which GitHub Actions names the file of a step's summary."""

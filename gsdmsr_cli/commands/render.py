@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 from gsdmsr_cli.commands._progress import progress_bar
-from gsdmsr_cli.commands._results import FILMS
 from gsdmsr_cli.commands._trained import Trained, open_trained
 from gsdmsr_cli.filming.draw_film import Timings, draw_film
 from gsdmsr_cli.filming.encode import require_encoder
@@ -20,6 +19,7 @@ from gsdmsr_cli.ground import say
 from gsdmsr_cli.ground.files import require_folder
 from gsdmsr_cli.ground.locks import one_of_readers, sole_writer
 from gsdmsr_cli.paths import make_film
+from gsdmsr_cli.runs.outputs import FILMS
 from gsdmsr_cli.scene.film import Film, PathOptions
 
 USUAL = ("test", "orbit")

@@ -50,9 +50,6 @@ tensor were called ``nodes``, and checkpoints counted events otherwise; 1 is con
 _READ = 1, SCHEMA
 _ABOUT, _LOG, _TRAINING = "run.json", "metrics.jsonl", "training.json"
 
-OUTPUTS = "eval", "render"
-"""Folders in that of a run which the commands of these names write, if told no other."""
-
 
 @dataclass(frozen=True)
 class Run:
