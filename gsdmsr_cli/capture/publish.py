@@ -20,7 +20,7 @@ from gsdmsr_cli.capture.marked import is_marked, mark, remove_marked
 from gsdmsr_cli.capture.write import NOTE, POINTS, REPORT, TIMINGS
 from gsdmsr_cli.formats.nerfstudio import MASK_KEYS, SIGN
 from gsdmsr_cli.ground.errors import DataError, UsageError
-from gsdmsr_cli.ground.files import read_json, remove_leftovers
+from gsdmsr_cli.ground.files import can_be_written, read_json, remove_leftovers
 
 _FILES = (SIGN, NOTE, POINTS, REPORT, TIMINGS)
 _FOLDERS = ("images", *sorted(FOLDERS.values()))
@@ -45,8 +45,7 @@ def place_of(out: Path) -> Path:
 
 def stages_of(place: Path) -> Path:
     """Return the folder for the stages of a scene: beside it, or inside where that cannot be."""
-    nearest = next(folder for folder in place.parents if folder.exists())
-    if place.is_dir() and (os.path.ismount(place) or not os.access(nearest, os.W_OK)):
+    if place.is_dir() and (os.path.ismount(place) or not can_be_written(place.parent)):
         return place / STAGES
     return place.with_name(f"{place.name}.stages")
 

@@ -117,7 +117,8 @@ def test_stages_lie_inside_where_nothing_can_be_written_beside(
 ) -> None:
     out, real = tmp_path / "parent" / "scene", os.access
     out.mkdir(parents=True)
-    monkeypatch.setattr(os, "access", lambda path, how: path != out.parent and real(path, how))
+    refused = out.parent, os.W_OK | os.X_OK
+    monkeypatch.setattr(os, "access", lambda *asked: asked != refused and real(*asked))
     publish, inside = command.publish, list[Path]()
 
     def note(scene: Path, place: Path) -> None:
