@@ -29,6 +29,13 @@ def along_an_arc(means: Tensor, time: float) -> Tensor:
     return torch.stack([cos * x - sin * y, sin * x + cos * y, z + rise], dim=1)
 
 
+def drifting_and_swinging(means: Tensor, time: float) -> Tensor:
+    """Every splat drifts along a curve of its own, and swings beside it twice."""
+    ways, since = torch.nn.functional.normalize(means.roll(1, dims=1), dim=1), time - 0.5
+    drift = 0.4 * since + 0.3 * since**2
+    return means + drift * ways + 0.08 * math.sin(4 * math.pi * since) * ways.roll(1, dims=1)
+
+
 CASES = {
     "control_points": Case(
         {"name": "control_points", "count": 16, "neighbours": 4, "time_ratio": 0.5},
@@ -47,6 +54,9 @@ CASES = {
             "smoothness": 0.01,
         },
         moved(each_its_own_way),
+    ),
+    "polynomial_fourier": Case(
+        {"name": "polynomial_fourier", "rate": [1e-2, 1e-4]}, moved(drifting_and_swinging)
     ),
 }
 """By the names of the motions; each has the trajectory that the motion is made for."""

@@ -1,0 +1,172 @@
+"""Every splat has a polynomial and a Fourier series of its own (Gaussian-Flow, Lin et al. 2024).
+
+Its dual-domain deformation (CVPR 2024, section 3): the residual of an attribute is a polynomial,
+which follows what drifts, plus a Fourier series, which follows what comes back. Both are evaluated
+at a time that each splat has scaled and shifted for itself, so that one may move in a tenth of the
+capture and its neighbour all the time.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from gsdmsr_cli.gaussians.moment import Moment
+from gsdmsr_cli.gaussians.splats import Splats
+from gsdmsr_cli.ground.geometry import quat_to_rotmat
+from gsdmsr_cli.model.layer import Facts, Instant, Layer
+from gsdmsr_cli.model.motion._rigidity import rigidity
+from gsdmsr_cli.model.parameter import Parameter
+from gsdmsr_cli.ops.nearest import nearest_points
+from gsdmsr_cli.options.strict import require
+
+ROWS, NEIGHBOURS = 1024, 8
+"""Splats that rigidity is evaluated at in a step, and how many of each other they are held to."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """Settings of the residuals and their regularisers.
+
+    Attributes:
+        degree: of the polynomials of positions, rotations and scales, 1 or more.
+        harmonics: number of frequencies of their Fourier series, 0 or more.
+        colour_degree, colour_harmonics: the same of colours; both 0 leave colours as they are.
+        period: of the lowest frequency [durations of the capture].
+        rate: learning rate of the positions' coefficients at the start and the end [scene bounds];
+            those of other attributes follow the rate of what they are added to.
+        time_rate: that of a splat's own scale and centre of time.
+        smoothness: weight of the mean squared way of a splat between one train time and the next,
+            in units of the bound.
+        rigidity: weight of the deviation of neighbouring splats from rigid motion.
+    """
+
+    degree: int = 3
+    harmonics: int = 3
+    colour_degree: int = 2
+    colour_harmonics: int = 2
+    period: float = 1.0
+    rate: tuple[float, float] = (2e-3, 4e-5)
+    time_rate: tuple[float, float] = (1e-3, 1e-4)
+    smoothness: float = 0.1
+    rigidity: float = 0.005
+
+    def __post_init__(self) -> None:
+        require(self, "degree", self.degree >= 1, "1 or more")
+        for key in ("harmonics", "colour_degree", "colour_harmonics"):
+            require(self, key, getattr(self, key) >= 0, "0 or more")
+        require(self, "period", self.period > 0, "a number above 0")
+        for key in ("rate", "time_rate"):
+            require(self, key, min(getattr(self, key)) > 0, "[start, end], both above 0")
+
+
+class DualDomain(Layer):
+    """What is stored plus c_1 s + .. + c_n s^n + sum of a_k sin(2 pi k s / T) + b_k cos(..).
+
+    With s = exp(log_time_scale) (t - time_centre), both of the splat's own.
+    """
+
+    def __init__(self, options: Options, facts: Facts, count: int) -> None:
+        self.options, self.facts = options, facts
+        terms = options.degree + 2 * options.harmonics
+        colour_terms = options.colour_degree + 2 * options.colour_harmonics
+        self.log_time_scales, self.time_centres = torch.zeros(count), torch.full((count,), 0.5)
+        self.means, self.quats, self.log_scales = (torch.zeros(count, terms, c) for c in (3, 4, 3))
+        parameters = [
+            Parameter("log_time_scales", self.log_time_scales, True, options.time_rate),
+            Parameter("time_centres", self.time_centres, True, options.time_rate),
+            Parameter("means", self.means, True, options.rate),
+            Parameter("quats", self.quats, True, "quats"),
+            Parameter("log_scales", self.log_scales, True, "log_scales"),
+        ]
+        self.colours = torch.zeros(count, colour_terms, 3) if colour_terms else None
+        if self.colours is not None:
+            parameters.append(Parameter("colours", self.colours, True, "sh"))
+        super().__init__(parameters)
+
+    def at(self, moment: Moment, instant: Instant) -> Moment:
+        """Return the splats with what the series add at a time."""
+        o, splats, times = self.options, moment.splats, self._own_times(instant.time)
+        basis = time_basis(times, o.degree, o.harmonics, o.period)
+        sh = splats.sh
+        if self.colours is not None:
+            own = time_basis(times, o.colour_degree, o.colour_harmonics, o.period)
+            sh = torch.cat([sh[:, :1] + own[:, None] @ self.colours, sh[:, 1:]], dim=1)
+        moved = replace(
+            splats,
+            means=splats.means + self.facts.bound * sum_terms(basis, self.means),
+            quats=splats.quats + sum_terms(basis, self.quats),
+            log_scales=splats.log_scales + sum_terms(basis, self.log_scales),
+            sh=sh,
+        )
+        return replace(moment, splats=moved)
+
+    def _own_times(self, time: float) -> Tensor:
+        """Return the time as each splat has scaled and shifted it (N,)."""
+        return self.log_time_scales.exp() * (time - self.time_centres)
+
+    def penalty(
+        self, moment: Moment, instant: Instant, generator: torch.Generator
+    ) -> Tensor | None:
+        """Return how far splats go within a frame, and how little neighbours move together.
+
+        After the paper's time smoothness and rigidity of neighbours; of splats drawn at random.
+        """
+        o = self.options
+        rows = torch.randperm(len(moment), generator=generator)[:ROWS]
+        rows = rows.to(self.means.device)
+        value: Tensor | None = None
+        now = self._offsets(rows, instant.time)
+        if o.smoothness > 0:
+            after = self._offsets(rows, instant.time + 1 / max(self.facts.frames - 1, 1))
+            ways = (after - now)[:, :3]
+            value = o.smoothness * ways.square().sum(dim=1).mean()
+        if o.rigidity > 0 and len(rows) > NEIGHBOURS:
+            deviation = o.rigidity * self._deviation(moment.splats.take(rows), now)
+            value = deviation if value is None else value + deviation
+        return value
+
+    def _offsets(self, rows: Tensor, time: float) -> Tensor:
+        """Return what is added to means [bounds] and quats of some splats, (M, 7)."""
+        o = self.options
+        basis = time_basis(self._own_times(time)[rows], o.degree, o.harmonics, o.period)
+        return torch.cat([sum_terms(basis, c[rows]) for c in (self.means, self.quats)], dim=1)
+
+    def _deviation(self, splats: Splats, offsets: Tensor) -> Tensor:
+        """Return how far splats are from taking each other along as rigid bodies would."""
+        points, quats = splats.means.detach(), splats.quats.detach()
+        offset, turn = offsets.split([3, 4], dim=1)
+        offset = offset * self.facts.bound
+        rotation = quat_to_rotmat(quats + turn) @ quat_to_rotmat(quats).mT
+        matrix = rotation - torch.eye(3, device=points.device)
+        shift = offset - (matrix @ points[:, :, None])[:, :, 0]
+        unused = points.new_zeros(len(points), 7)
+        guesses = torch.zeros(len(points), NEIGHBOURS, dtype=torch.int32, device=points.device)
+        near = nearest_points(points, points, guesses)
+        return rigidity(points, torch.cat([matrix.flatten(1), shift, unused], dim=1), near)
+
+
+def time_basis(times: Tensor, degree: int, harmonics: int, period: float) -> Tensor:
+    """Return s, .., s^degree, then sin and cos of each frequency, of times s (N,): (N, K)."""
+    powers = [times]
+    for _ in range(degree - 1):
+        powers.append(powers[-1] * times)
+    columns = [torch.stack(powers[:degree], dim=1)] if degree else []
+    if harmonics:
+        frequencies = torch.arange(1, harmonics + 1, device=times.device) * (2 * math.pi / period)
+        angles = times[:, None] * frequencies.to(times)
+        columns += [angles.sin(), angles.cos()]
+    return torch.cat(columns, dim=1)
+
+
+def sum_terms(basis: Tensor, coefficients: Tensor) -> Tensor:
+    """Return the sum of terms (N, K) times coefficients (N, K, C), which is (N, C)."""
+    return (basis[:, None] @ coefficients)[:, 0]
+
+
+def start(options: Options, facts: Facts, splats: Splats, generator: torch.Generator) -> DualDomain:
+    """Return a motion that is the identity until its coefficients have been trained."""
+    return DualDomain(options, facts, len(splats))
