@@ -71,6 +71,16 @@ def require(options: object, key: str, ok: bool, allowed: str) -> None:
         raise InvalidError(key, getattr(options, key), allowed)
 
 
+def require_rates(options: object, *keys: str) -> None:
+    """Check that learning rates, at the start and the end of a training, are above 0.
+
+    Raises:
+        InvalidError: one is not.
+    """
+    for key in keys:
+        require(options, key, min(getattr(options, key)) > 0, "[start, end], both above 0")
+
+
 def build(cls: type[T], mapping: Mapping[str, Any], where: str) -> T:
     """Build the dataclass ``cls``, and those nested in it, from ``mapping``.
 

@@ -21,7 +21,7 @@ from gsdmsr_cli.model.layer import Facts, Instant, Layer
 from gsdmsr_cli.model.motion._rigidity import rigidity
 from gsdmsr_cli.model.parameter import Parameter
 from gsdmsr_cli.ops.nearest import nearest_points
-from gsdmsr_cli.options.strict import require
+from gsdmsr_cli.options.strict import require, require_rates
 
 ROWS, NEIGHBOURS = 1024, 8
 """Splats that rigidity is evaluated at in a step, and how many of each other they are held to."""
@@ -52,15 +52,14 @@ class Options:
     rate: tuple[float, float] = (2e-3, 4e-5)
     time_rate: tuple[float, float] = (1e-3, 1e-4)
     smoothness: float = 0.1
-    rigidity: float = 0.005
+    rigidity: float = 0.001
 
     def __post_init__(self) -> None:
         require(self, "degree", self.degree >= 1, "1 or more")
         for key in ("harmonics", "colour_degree", "colour_harmonics"):
             require(self, key, getattr(self, key) >= 0, "0 or more")
         require(self, "period", self.period > 0, "a number above 0")
-        for key in ("rate", "time_rate"):
-            require(self, key, min(getattr(self, key)) > 0, "[start, end], both above 0")
+        require_rates(self, "rate", "time_rate")
 
 
 class DualDomain(Layer):
