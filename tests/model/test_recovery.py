@@ -21,6 +21,13 @@ def each_its_own_way(means: Tensor, time: float) -> Tensor:
     return means + (time - 0.5) * 0.5 * torch.nn.functional.normalize(means.roll(1, dims=1), dim=1)
 
 
+def waving(means: Tensor, time: float) -> Tensor:
+    """Splats swing about where they are, by how high they are and how far along."""
+    x, y, z = means.unbind(1)
+    offsets = [torch.sin(4 * time + 2 * z), torch.cos(3 * time + 2 * x), torch.sin(5 * time + y)]
+    return means + 0.15 * torch.stack(offsets, dim=1)
+
+
 def along_an_arc(means: Tensor, time: float) -> Tensor:
     """All splats go round one axis together, and up: a rigid motion."""
     turn, rise = 0.8 * (time - 0.5), 0.3 * (time - 0.5)
@@ -57,6 +64,18 @@ CASES = {
     ),
     "polynomial_fourier": Case(
         {"name": "polynomial_fourier", "rate": [1e-2, 1e-4]}, moved(drifting_and_swinging)
+    ),
+    "deformation_network": Case(
+        {
+            "name": "deformation_network",
+            "depth": 4,
+            "position_octaves": 2,
+            "time_octaves": 2,
+            "noise": 0.01,
+        },
+        moved(waving),
+        options=("optimizer.network=[0.01,1e-5]",),
+        steps=1500,
     ),
 }
 """By the names of the motions; each has the trajectory that the motion is made for."""
