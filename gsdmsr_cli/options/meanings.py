@@ -54,8 +54,16 @@ def _default(field: dataclasses.Field[Any]) -> Any:
 
 
 def _texts(options: type[Any]) -> dict[str, str]:
-    """Return what the docstring says of each attribute; several may share a line."""
-    _, _, lines = (inspect.getdoc(options) or "").partition("Attributes:\n")
+    """Return what the docstring says of each attribute, or those of the classes it extends."""
+    texts: dict[str, str] = {}
+    for one in reversed(options.__mro__):
+        texts |= _texts_of(inspect.cleandoc(one.__doc__ or ""))
+    return texts
+
+
+def _texts_of(docstring: str) -> dict[str, str]:
+    """Return what a docstring says of each attribute; several may share a line."""
+    _, _, lines = docstring.partition("Attributes:\n")
     texts: dict[str, str] = {}
     names: list[str] = []
     for line in lines.splitlines():

@@ -54,6 +54,24 @@ def test_every_option_is_listed_with_its_kind_default_and_meaning() -> None:
     ]
 
 
+@dataclass(frozen=True)
+class Extended(Inner):
+    """Settings that extend others.
+
+    Attributes:
+        width: another width.
+        depth: how deep it is.
+    """
+
+    depth: int = 1
+
+
+def test_what_an_extended_class_says_of_its_options_holds_unless_it_is_said_anew() -> None:
+    texts = {meaning.key: meaning.text for meaning in meanings(Extended)}
+    assert texts["width"] == "another width." and texts["depth"] == "how deep it is."
+    assert texts["height"] == "sides of it, in pixels."
+
+
 def all_options() -> list[Any]:
     packages = (
         "gsdmsr_cli.model.motion", "gsdmsr_cli.model.layers", "gsdmsr_cli.training.losses",
