@@ -147,7 +147,7 @@ class BlockStore:
         while True:
             rows = np.flatnonzero(self._numbers == _FREE)
             if len(rows) >= needed:
-                return rows[:needed]
+                return rows[:needed].copy()  # a view would keep them all, for each array
             oldest = self._numbers[self._used.argmin()]
             self._free(self._numbers == oldest)
 

@@ -6,6 +6,7 @@ import multiprocessing
 import os
 import signal
 import sys
+import tracemalloc
 from collections import OrderedDict
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -212,3 +213,16 @@ def test_one_process_waits_while_another_writes() -> None:
     for child in children:
         child.join(timeout=60)
     assert [child.exitcode for child in children] == [0, 0]
+
+
+def test_what_is_known_of_places_grows_with_the_arrays_and_not_with_the_memory() -> None:
+    store, count = BlockStore(64 << 20), 500
+    store.put(1, content(1, BLOCK))
+    tracemalloc.start()
+    try:
+        for number in range(2, count + 2):
+            store.put(number, content(1, BLOCK))
+        held = tracemalloc.get_traced_memory()[0]
+    finally:
+        tracemalloc.stop()
+    assert held < 500 * count
