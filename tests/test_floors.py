@@ -25,9 +25,6 @@ PLUGINS = (
 )  # fmt: skip
 """Folders of the package whose files are plug-ins."""
 
-EMPTY = ("model.layers",)
-"""Kinds of which no file comes with the package."""
-
 KERNELS = "ops/*/cpu.py", "ops/*/cpu/*.py", "backends/cpu/*.py"
 """Where the kernels of the CPU are."""
 
@@ -147,7 +144,7 @@ def test_kinds_of_plugins_do_not_import_one_another(kind: str) -> None:
 def test_plugins_do_not_import_their_siblings(kind: str) -> None:
     package = f"gsdmsr_cli.{kind}"
     plugins = {m for m in MODULES if m.startswith(f"{package}.") and "._" not in m}
-    assert bool(plugins) == (kind not in EMPTY)
+    assert plugins
     for module in plugins:
         assert not MODULES[module] & (plugins - {module}), module
 

@@ -62,12 +62,15 @@ class Layer(ABC):
         identity_at_start: whether a new layer leaves the splats as they are, at all times.
         concerns_still: whether splats that stand still go through this layer too. If not, it is
             given, and holds, only those that move.
+        before_motion: whether it is applied before the motion, to the canonical splats, whatever
+            the instant; of two such layers in the order of the preset's list.
         needs_camera, needs_jitter: what it wants to know of an instant beside the time.
         shades: whether ``shade`` does anything.
     """
 
     identity_at_start: ClassVar[bool] = True
     concerns_still: ClassVar[bool] = False
+    before_motion: ClassVar[bool] = False
     needs_camera: ClassVar[bool] = False
     needs_jitter: ClassVar[bool] = False
     shades: ClassVar[bool] = False
@@ -143,6 +146,16 @@ class Layer(ABC):
             the names of the parameters that have new values.
         """
         return ()
+
+    def kept(self) -> Tensor | None:
+        """Return which of the splats that it is given are ever drawn, (N,) bool; None if all."""
+        return None
+
+    def fit(self, splats: Splats, generator: torch.Generator) -> None:  # noqa: B027  (most do not)
+        """Fit what is not learnt by steps, such as codebooks, to the splats as they are now.
+
+        The event ``codebooks`` calls it, without a graph.
+        """
 
     def penalty(
         self, moment: Moment, instant: Instant, generator: torch.Generator

@@ -35,7 +35,8 @@ class Model:
     Attributes:
         splats: all of them, those that move first: taking them apart then copies nothing. Their
             tensors are the same objects for good.
-        layers: by name, in the order in which they are applied, the motion first.
+        layers: by name, the motion first, in the order in which they are applied; those that say
+            ``before_motion`` are applied before all others.
         moving: how many splats move; the others stay where they are at all times, and go only
             through layers that concern them.
         precision: what fields compute in on a GPU, see ``ops.precision``.
@@ -114,9 +115,12 @@ class Model:
                 add to them were constant.
         """
         canonical = Moment(self.splats)
-        moments = [canonical] * len(instants)
         with computing_in(self.precision):
-            for layer in self.layers.values():
+            begun = [canonical]
+            for layer in self._before_motion(True):
+                begun = self._through(layer, begun, instants[:1])
+            moments = begun * len(instants)
+            for layer in self._before_motion(False):
                 moments = self._through(layer, moments, instants)
         if gradient_mask is None:
             return moments
@@ -128,6 +132,10 @@ class Model:
             if layer.shades:
                 frame = layer.shade(frame, instant)
         return frame
+
+    def _before_motion(self, wanted: bool) -> list[Layer]:
+        """Return the layers that are applied before the motion, or the motion and those after."""
+        return [layer for layer in self.layers.values() if layer.before_motion is wanted]
 
     def _through(
         self, layer: Layer, moments: list[Moment], instants: Sequence[Instant]

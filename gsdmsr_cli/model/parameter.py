@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 from torch import Tensor
 
@@ -48,3 +49,18 @@ class Parameter:
 def tensors_of(parameters: Iterable[Parameter]) -> dict[str, Tensor]:
     """Return the tensors by name, in the order of the list."""
     return {parameter.name: parameter.tensor for parameter in parameters}
+
+
+class Part(Protocol):
+    """A level of a grid or a layer of a network: a named tuple of tensors."""
+
+    def _asdict(self) -> Mapping[str, Tensor]: ...
+
+
+def name_parameters(name: str, parts: Sequence[Part], rate: Rate) -> list[Parameter]:
+    """Return a grid's levels or a network's layers as parameters "name.0.space" and so on."""
+    return [
+        Parameter(f"{name}.{index}.{field}", tensor, rate=rate)
+        for index, part in enumerate(parts)
+        for field, tensor in part._asdict().items()
+    ]

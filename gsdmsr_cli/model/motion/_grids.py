@@ -6,18 +6,9 @@ from collections.abc import Sequence
 
 from torch import Tensor
 
-from gsdmsr_cli.model.parameter import Parameter, Rate
-from gsdmsr_cli.ops.network import Layer
-from gsdmsr_cli.ops.planes import Level
+from gsdmsr_cli.model.parameter import name_parameters
 
-
-def name_parameters(name: str, parts: Sequence[Level | Layer], rate: Rate) -> list[Parameter]:
-    """Return a grid's levels or a network's layers as parameters "name.0.space" and so on."""
-    return [
-        Parameter(f"{name}.{index}.{field}", tensor, rate=rate)
-        for index, part in enumerate(parts)
-        for field, tensor in part._asdict().items()
-    ]
+__all__ = ["name_parameters", "split_times", "time_nodes"]
 
 
 def split_times(rows: Tensor, count: int) -> Sequence[Tensor]:

@@ -1,25 +1,12 @@
-"""Checks that options of motions ask for sizes of grids and networks that the kernels support.
-
-The limits are those of all devices, so that what has been trained on one goes on on another.
-"""
+"""Checks of options that motions alone have; those of other layers too are ``model.limits``."""
 
 from __future__ import annotations
 
-from gsdmsr_cli.backends.cpu.simd import LANES
-from gsdmsr_cli.backends.cuda.compiler import MOST_HASH_LEVELS, MOST_LEVELS
+from gsdmsr_cli.backends.cuda.compiler import MOST_LEVELS
+from gsdmsr_cli.model.limits import require_multiples
 from gsdmsr_cli.options.strict import require
 
-
-def require_multiples(options: object, *keys: str, least: int = LANES) -> None:
-    """Check that options are multiples of 16, ``least`` or more, in a ``__post_init__``.
-
-    Raises:
-        InvalidError: one is not.
-    """
-    for key in keys:
-        value = getattr(options, key)
-        ok = value >= least and value % LANES == 0
-        require(options, key, ok, f"a multiple of {LANES}, {least} or more")
+__all__ = ["require_levels", "require_multiples", "require_resolutions"]
 
 
 def require_resolutions(options: object, *keys: str) -> None:
@@ -41,16 +28,3 @@ def require_levels(options: object, key: str, besides: int = 0) -> None:
     levels, most = getattr(options, key), MOST_LEVELS - besides
     ok = 1 <= len(levels) <= most and min(levels) >= 2
     require(options, key, ok, f"1 to {most} whole numbers, each 2 or more")
-
-
-def require_hash_levels(options: object, levels: str, features: str) -> None:
-    """Check how many levels a hash grid has, and how many features these give together.
-
-    Raises:
-        InvalidError: there are too few or too many levels, or they do not fit a network.
-    """
-    count, each = getattr(options, levels), getattr(options, features)
-    require(options, levels, 1 <= count <= MOST_HASH_LEVELS, f"1 to {MOST_HASH_LEVELS}")
-    require(options, features, 1 <= each <= 8, "1 to 8")
-    whole = count * each % LANES == 0
-    require(options, levels, whole, f"times {features} a multiple of {LANES}")
