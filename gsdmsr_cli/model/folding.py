@@ -13,6 +13,7 @@ from torch.autograd.function import once_differentiable
 
 from gsdmsr_cli.gaussians.moment import Moment
 from gsdmsr_cli.gaussians.splats import Splats
+from gsdmsr_cli.ground.geometry import scaled_axes
 from gsdmsr_cli.model.layer import Instant, Layer
 
 
@@ -41,9 +42,14 @@ def split(moment: Moment, count: int) -> tuple[Moment, Moment]:
 def join(whole: Moment, first: Moment, rest: Moment, after: Moment) -> Moment:
     """Return ``whole``, which has been split, with its first rows as they are ``after`` a layer.
 
+    Where the layer has added axes, the other rows get those of their rotations and scales.
+
     Raises:
-        ValueError: the layer has added what splats that stand still would lack.
+        ValueError: the layer has added features, which splats that stand still would lack.
     """
+    if after.axes is not None and rest.axes is None:
+        own = scaled_axes(rest.splats.quats, rest.splats.log_scales)
+        rest = Moment(rest.splats, own, rest.features)
     changed = {
         name: torch.cat([tensor, getattr(rest.splats, name)])
         for name, tensor in after.splats.tensors().items()

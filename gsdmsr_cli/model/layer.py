@@ -137,6 +137,29 @@ class Layer(ABC):
     def advance(self, progress: float) -> None:  # noqa: B027  (most have no phases)
         """Enter the phase of training that belongs to ``progress`` in [0, 1]."""
 
+    def to_split(self) -> Tensor | None:
+        """Return which splats are split rather than cloned if they grow, (N,) bool, or None.
+
+        Those that are large in what this layer holds, such as time; density control knows of those
+        that are large in space.
+        """
+        return None
+
+    def scatter(  # noqa: B027  (most hold nothing that children differ in)
+        self, children: Tensor, splats: Splats, shrink: float, generator: torch.Generator
+    ) -> None:
+        """Tell the children of splits apart, which so far hold what their parents did.
+
+        Called without a graph after ``take``.
+
+        Args:
+            children: (N,) bool, which splats are such.
+            splats: N, whose means lie apart and whose scales are less already; may be changed in
+                place.
+            shrink: by what the children's extents are divided.
+            generator: source of random choices.
+        """
+
     def reanchor(self, splats: Splats) -> Sequence[str]:
         """Adapt the layer to where the splats are now, since there are others than before.
 

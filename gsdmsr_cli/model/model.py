@@ -220,6 +220,24 @@ class Model:
         self.take_moving(rows, rows > 0, moving)
 
     @torch.no_grad()
+    def to_split(self) -> Tensor:
+        """Return which splats a layer wants to be split rather than cloned, (N,) bool."""
+        found = torch.zeros(len(self.splats), dtype=torch.bool, device=self.splats.means.device)
+        for layer in self.layers.values():
+            own = layer.to_split()
+            if own is not None:
+                found[: len(own)] |= own
+        return found
+
+    @torch.no_grad()
+    def scatter(self, children: Tensor, shrink: float, generator: torch.Generator) -> None:
+        """Let layers tell the children (N,) of splits apart, see ``Layer.scatter``."""
+        for layer in self.layers.values():
+            count = self._rows(layer)
+            if children[:count].any():
+                layer.scatter(children[:count], self._firsts(count), shrink, generator)
+
+    @torch.no_grad()
     def reanchor(self) -> list[str]:
         """Adapt layers to the present splats; return the names of the parameters that changed."""
         changed = []

@@ -20,6 +20,9 @@ from gsdmsr_cli.training.optimizer import Adam
 from gsdmsr_cli.training.saliency import Saliency
 from gsdmsr_cli.training.statistics import DensityStatistics
 
+SPLIT_SHRINK = 1.6
+"""A split splat's children are this much smaller (3DGS: 0.8 times the two children)."""
+
 MOST_LOST = 0.5
 """Share of the splats that may be dropped at a time for values that are not finite."""
 
@@ -33,12 +36,14 @@ class Resize:
         fresh: (M,) bool, rows that are clones or children: they begin without momentum.
         splats: M splats, the values that the rows begin with; those of their parents if None.
         still: (M,) bool, rows that stand still from now on; those whose parents do, if None.
+        split: (M,) bool, rows that are children of a split, which layers tell apart as well.
     """
 
     rows: Tensor
     fresh: Tensor
     splats: Splats | None = None
     still: Tensor | None = None
+    split: Tensor | None = None
 
 
 def kept(rows: Tensor) -> Resize:
@@ -47,11 +52,13 @@ def kept(rows: Tensor) -> Resize:
 
 
 @torch.no_grad()
-def resize_model(model: Model, change: Resize) -> tuple[Tensor, Tensor]:
+def resize_model(
+    model: Model, change: Resize, generator: torch.Generator | None = None
+) -> tuple[Tensor, Tensor]:
     """Let a model have other splats; return rows and fresh (M,) in the order that they now have.
 
     The model wants rows that move before those that stand still; of either kind they stay in the
-    order given.
+    order given. ``generator`` is the source of what tells the children of splits apart.
     """
     rows, fresh = change.rows, change.fresh
     still = rows >= model.moving
@@ -63,6 +70,8 @@ def resize_model(model: Model, change: Resize) -> tuple[Tensor, Tensor]:
     if change.splats is not None:
         for name, tensor in model.splats.tensors().items():
             tensor.copy_(getattr(change.splats, name)[order])
+    if change.split is not None and generator is not None:
+        model.scatter(change.split[order], SPLIT_SHRINK, generator)
     return rows, fresh
 
 
@@ -116,7 +125,7 @@ class Population:
         count = len(change.rows)
         if count > max(self.cap, len(self.model.splats)):
             raise GsdmsrError(f"{count} splats are more than density.cap, {self.cap}; raise it")
-        rows, fresh = resize_model(self.model, change)
+        rows, fresh = resize_model(self.model, change, self.generator)
         for parameter in self.model.parameters():
             if parameter.per_splat:
                 count = len(parameter.tensor)  # of those that move alone, for some

@@ -104,6 +104,7 @@ def test_take_resizes_splats_and_motion_alike(name: str) -> None:
 
 
 HELD = {
+    "covariance_4d": ["times", "log_durations", "tilts"],
     "multiscale": ["embeddings"],
     "polynomial_fourier": [
         "log_time_scales", "time_centres", "means", "quats", "log_scales", "colours",

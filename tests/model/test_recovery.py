@@ -9,10 +9,19 @@ from typing import cast
 
 import pytest
 import torch
-from recovery_checks import COUNT, Case, assert_recovers, canonical_splats, lives_of, moved
+from recovery_checks import (
+    COUNT,
+    Case,
+    Truth,
+    assert_recovers,
+    canonical_splats,
+    lives_of,
+    moved,
+)
 from torch import Tensor
 
 from gsdmsr_cli.gaussians.moment import Moment
+from gsdmsr_cli.gaussians.splats import Splats
 from gsdmsr_cli.model.model import Model
 
 
@@ -43,6 +52,28 @@ def drifting_and_swinging(means: Tensor, time: float) -> Tensor:
     return means + drift * ways + 0.08 * math.sin(4 * math.pi * since) * ways.roll(1, dims=1)
 
 
+SPAN = 0.13
+"""Standard deviation in time for which splats are seen."""
+
+
+def seen_around(times: Tensor) -> Truth:
+    """Return the truth that splats go straight on, and are seen around times of their own."""
+
+    def truth(splats: Splats, time: float) -> Moment:
+        since = time - times
+        ways = torch.nn.functional.normalize(splats.means.roll(1, dims=1), dim=1)
+        opacities = splats.logit_opacities.sigmoid() * torch.exp(-(since**2) / (2 * SPAN**2))
+        means = splats.means + 0.5 * since[:, None] * ways
+        return Moment(replace(splats, means=means, logit_opacities=opacities.logit()))
+
+    return truth
+
+
+CENTRES = torch.linspace(0.2, 0.8, COUNT)
+
+HALF_LIFE = SPAN * math.sqrt(2 * math.log(2))
+"""Time after which half of the opacity is left."""
+
 CASES = {
     "control_points": Case(
         {"name": "control_points", "count": 16, "neighbours": 4, "time_ratio": 0.5},
@@ -61,6 +92,19 @@ CASES = {
             "smoothness": 0.01,
         },
         moved(each_its_own_way),
+    ),
+    "covariance_4d": Case(
+        {
+            "name": "covariance_4d",
+            "duration": 0.3,
+            "time_rate": [1e-2, 1e-4],
+            "duration_rate": [2e-2, 1e-4],
+            "tilt_rate": [1e-2, 1e-4],
+        },
+        seen_around(CENTRES),
+        options=["optimizer.log_scales=[3e-3,1e-5]", "optimizer.quats=[3e-3,1e-5]"],
+        steps=1000,
+        lives=torch.stack([CENTRES - HALF_LIFE, CENTRES + HALF_LIFE], dim=1).clamp(0, 1),
     ),
     "polynomial_fourier": Case(
         {"name": "polynomial_fourier", "rate": [1e-2, 1e-4]}, moved(drifting_and_swinging)

@@ -15,11 +15,8 @@ from gsdmsr_cli.ground.errors import GsdmsrError
 from gsdmsr_cli.ground.geometry import quat_to_rotmat
 from gsdmsr_cli.options.preset import DensityOptions, Preset
 from gsdmsr_cli.training.population import Event, Tick
-from gsdmsr_cli.training.resizing import Population, Resize
+from gsdmsr_cli.training.resizing import SPLIT_SHRINK, Population, Resize
 from gsdmsr_cli.training.statistics import DensityStatistics
-
-SPLIT_SHRINK = 1.6
-"""A split splat's children are this much smaller (3DGS: 0.8 times the two children)."""
 
 PRUNE_EVERY = 500
 """Interval of pruning alone, once growing has ended [steps]."""
@@ -62,16 +59,16 @@ class Density(Event):
         growing = self._growing(tick)
         self.rounds += growing
         model, given = population.model, (population.radius, growing, population.generator)
-        rows, fresh, grown = grow_and_prune(
-            model.splats, population.statistics, self.options, *given
+        change = grow_and_prune(
+            model.splats, population.statistics, self.options, *given, model.to_split()
         )
-        if not len(rows):
+        if not len(change.rows):
             raise GsdmsrError(
                 f"no splats are left at step {tick.step}; lower density.prune_opacity or "
                 "check that cameras and pictures belong together"
             )
         population.statistics.clear()
-        return Resize(rows, fresh, grown)
+        return change
 
     def state(self) -> dict[str, Any]:
         """Return how often splats have grown."""
@@ -95,7 +92,8 @@ def grow_and_prune(
     radius: float,
     growing: bool,
     generator: torch.Generator,
-) -> tuple[Tensor, Tensor, Splats]:
+    to_split: Tensor | None = None,
+) -> Resize:
     """Decide which splats go on, and which are cloned and split.
 
     Args:
@@ -105,10 +103,10 @@ def grow_and_prune(
         radius: the scene's radius [world units].
         growing: whether splats may be cloned and split, or only pruned.
         generator: source of the split children's positions.
+        to_split: (N,) bool, splats that are split if they grow, even if they are small.
 
     Returns:
-        rows (M,), the parent of each new row; fresh (M,) bool, whether the row is a clone or a
-        child; and the M new splats, with the children moved and shrunk.
+        which splats there are to be; the children have been moved and shrunk.
     """
     largest = splats.log_scales.exp().amax(dim=1)
     kept = torch.sigmoid(splats.logit_opacities) >= options.prune_opacity
@@ -117,7 +115,8 @@ def grow_and_prune(
         kept &= tensor.isfinite().reshape(len(splats), -1).all(dim=1)
     wanted = _chosen(statistics, options, int(kept.sum())) if growing else torch.zeros_like(kept)
     grows = kept & wanted
-    split = grows & (largest > options.split_scale * radius)
+    large = largest > options.split_scale * radius
+    split = grows & (large if to_split is None else large | to_split)
     survivors, clones = kept & ~split, grows & ~split
     children = split.nonzero().flatten().repeat(2)
     rows = torch.cat([survivors.nonzero().flatten(), clones.nonzero().flatten(), children])
@@ -125,7 +124,8 @@ def grow_and_prune(
     grown = splats.detach().take(rows)
     if len(children):
         _scatter_children(grown, len(children), generator)
-    return rows, fresh, grown
+    born = torch.arange(len(rows), device=rows.device) >= len(rows) - len(children)
+    return Resize(rows, fresh, grown, split=born)
 
 
 def _chosen(statistics: DensityStatistics, options: DensityOptions, kept: int) -> Tensor:

@@ -78,12 +78,15 @@ def motion_saliency(model: Model, camera: Camera | None = None) -> tuple[Tensor,
 
     A splat's saliency is the largest deviation from that mean over the moments: of its centre, in
     units of the geometric mean of its scales; of its log scales; of its rotation, as an angle
-    [rad]; of its logit of opacity and of its colour.
+    [rad]; of its logit of opacity and of its colour. Layers that concern splats that stand still as
+    well have no part in this: what they do, they go on doing.
 
     Args:
         model: of N splats.
         camera: that looks at all moments, for layers that want one.
     """
+    layers = {name: own for name, own in model.layers.items() if not own.concerns_still}
+    model = Model(model.splats, layers, model.moving, model.precision)
     mean = _mean(model, camera)
     size = mean.log_scales.mean(dim=1).exp()
     saliency = mean.means.new_zeros(len(mean))

@@ -12,10 +12,8 @@ from kernel_checks import generator
 from gsdmsr_cli.gaussians.splats import Splats
 from gsdmsr_cli.ground.geometry import covariance
 from gsdmsr_cli.options.preset import DensityOptions
-from gsdmsr_cli.training.population.density import (
-    SPLIT_SHRINK,
-    grow_and_prune,
-)
+from gsdmsr_cli.training.population.density import grow_and_prune
+from gsdmsr_cli.training.resizing import SPLIT_SHRINK
 from gsdmsr_cli.training.statistics import DensityStatistics
 
 RADIUS = 2.0
@@ -47,11 +45,21 @@ def statistics_of(means: list[float]) -> DensityStatistics:
 def grown(
     splats: Splats, gradients: list[float], options: DensityOptions = OPTIONS, growing: bool = True
 ) -> tuple[list[int], list[bool], Splats]:
-    rows, fresh, after = grow_and_prune(
+    change = grow_and_prune(
         splats, statistics_of(gradients), options, RADIUS, growing, generator(7)
     )
-    assert len(rows) == len(fresh) == len(after)
-    return rows.tolist(), fresh.tolist(), after
+    assert change.splats is not None
+    assert len(change.rows) == len(change.fresh) == len(change.splats)
+    return change.rows.tolist(), change.fresh.tolist(), change.splats
+
+
+def test_a_small_splat_that_a_layer_wants_split_is_split_if_it_grows() -> None:
+    splats, wanted = splats_of([SMALL, SMALL, SMALL]), torch.tensor([True, True, False])
+    given = statistics_of([0.0, 5e-3, 5e-3]), OPTIONS, RADIUS, True, generator(7), wanted
+    change = grow_and_prune(splats, *given)
+    assert change.rows.tolist() == [0, 2, 2, 1, 1]
+    assert change.fresh.tolist() == [False, False, True, True, True]
+    assert change.split is not None and change.split.tolist() == [False] * 3 + [True] * 2
 
 
 def test_nothing_changes_below_the_threshold() -> None:

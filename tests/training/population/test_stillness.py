@@ -61,6 +61,28 @@ def test_a_way_counts_in_units_of_the_own_size() -> None:
     torch.testing.assert_close(mean.means, still_splats().means, atol=1e-6, rtol=0)
 
 
+class Rising(Layer):
+    """Lets all splats rise, those that stand still as well."""
+
+    concerns_still = True
+
+    def at(self, moment: Moment, instant: Instant) -> Moment:
+        way = torch.tensor([0.0, 0.0, 1.0]) * (1 + instant.time)
+        return replace(moment, splats=replace(moment.splats, means=moment.splats.means + way))
+
+
+def test_what_layers_do_to_still_splats_too_neither_counts_nor_is_done_twice() -> None:
+    splats = still_splats()
+    layers: dict[str, Layer] = {"motion": Known(lambda s, _: s), "layers.rising": Rising()}
+    model = Model(splats, layers)
+    drawn = model.at(model.instant(0.5)).splats.means.detach().clone()
+    saliency, mean = motion_saliency(model)
+    torch.testing.assert_close(saliency, torch.zeros(3), atol=1e-4, rtol=0)
+    stand_still(model, saliency < 1, mean)
+    assert model.moving == 0
+    torch.testing.assert_close(model.at(model.instant(0.5)).splats.means, drawn)
+
+
 def test_an_offset_for_all_times_is_no_motion() -> None:
     def at(splats: Splats, time: float) -> Splats:
         return replace(splats, means=splats.means + 3)

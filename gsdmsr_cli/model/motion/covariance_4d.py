@@ -1,0 +1,166 @@
+"""Splats are Gaussians in space and time; what is drawn is their slice at a time.
+
+4D Gaussian splatting (Yang Z. et al., ICLR 2024), section 3.2. A Gaussian over time and space that
+lies obliquely to the axis of time is one that moves: with its covariance S, its slice at t has the
+mean x + S_xt / S_tt (t - mu) and the covariance S_xx - S_xt S_tx / S_tt, and its opacity is
+multiplied by the marginal exp(-(t - mu)^2 / (2 S_tt)).
+
+S is R diag(scales)^2 R^T. Yang et al. make the rotation R of two quaternions, v -> a v b. Here a is
+what is stored as ``quats``, and b its conjugate times the splat's ``tilts``: so a tilt of 1 is a
+splat that stands still, and rotations in space mean what they do in every other motion.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from gsdmsr_cli.gaussians.fading import fade
+from gsdmsr_cli.gaussians.moment import Moment
+from gsdmsr_cli.gaussians.splats import Splats
+from gsdmsr_cli.ground.geometry import scaled_axes
+from gsdmsr_cli.model.layer import Facts, Instant, Layer
+from gsdmsr_cli.model.motion._quaternions import left_products, right_products
+from gsdmsr_cli.model.parameter import Parameter
+from gsdmsr_cli.model.times import spread_times, take_known
+from gsdmsr_cli.options.strict import require, require_rates
+
+LEAST_VARIANCE = 1e-12
+"""Variances in time count as this at least."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """Settings.
+
+    Attributes:
+        duration: standard deviation in time that splats begin with [durations of the capture].
+        split_duration: a growing splat with a longer one is split, however small it is in space.
+        colour_harmonics: number of frequencies of the colours in time, the 4D spherindrical
+            harmonics of section 3.3; 0 is none.
+        time_rate: learning rate of the means in time at the start and the end.
+        duration_rate: that of the logarithms of the durations.
+        tilt_rate: that of the quaternions between space and time.
+    """
+
+    duration: float = 0.15
+    split_duration: float = 0.05
+    colour_harmonics: int = 0
+    time_rate: tuple[float, float] = (1e-3, 1e-4)
+    duration_rate: tuple[float, float] = (1e-2, 1e-3)
+    tilt_rate: tuple[float, float] = (5e-3, 1e-4)
+
+    def __post_init__(self) -> None:
+        for key in ("duration", "split_duration"):
+            require(self, key, getattr(self, key) > 0, "a number above 0")
+        require(self, "colour_harmonics", self.colour_harmonics >= 0, "0 or more")
+        require_rates(self, "time_rate", "duration_rate", "tilt_rate")
+
+
+class Slices(NamedTuple):
+    """What slices of N Gaussians have at all times.
+
+    Attributes:
+        variances: (N,) S_tt.
+        velocities: (N, 3) S_xt / S_tt [world units / duration of the capture].
+        axes: (N, 3, 3) A with A A^T = S_xx - S_xt S_tx / S_tt [world units].
+    """
+
+    variances: Tensor
+    velocities: Tensor
+    axes: Tensor
+
+
+class Covariance4D(Layer):
+    """Means (N,) and logarithms of durations (N,) in time, tilts (N, 4), and colours in time."""
+
+    identity_at_start = False
+
+    def __init__(self, options: Options, splats: Splats) -> None:
+        count = len(splats)
+        self.options = options
+        self.times = spread_times(count)
+        self.log_durations = torch.full((count,), math.log(options.duration))
+        self.tilts = torch.zeros(count, 4)
+        self.tilts[:, 0] = 1
+        parameters = [
+            Parameter("times", self.times, True, options.time_rate),
+            Parameter("log_durations", self.log_durations, True, options.duration_rate),
+            Parameter("tilts", self.tilts, True, options.tilt_rate),
+        ]
+        self.sh: Tensor | None = None
+        if options.colour_harmonics:
+            self.sh = torch.zeros(count, options.colour_harmonics, *splats.sh.shape[1:])
+            parameters.append(Parameter("sh", self.sh, True, "sh"))
+        super().__init__(parameters)
+
+    def at(self, moment: Moment, instant: Instant) -> Moment:
+        """Return the slices of the Gaussians at a time."""
+        splats, since = moment.splats, instant.time - self.times
+        slices = self._slices(splats, slice(None))
+        exponents = since.square() / (2 * slices.variances)
+        drawn = replace(
+            splats,
+            means=splats.means + since[:, None] * slices.velocities,
+            logit_opacities=fade(splats.logit_opacities, exponents),
+            sh=splats.sh if self.sh is None else splats.sh + self._colours(since, self.sh),
+        )
+        return replace(moment, splats=drawn, axes=slices.axes)
+
+    def _slices(self, splats: Splats, rows: Tensor | slice) -> Slices:
+        """Slice the Gaussians of some rows, which ``splats`` are.
+
+        S is M M^T. With m the row of M that is time and U an orthonormal basis of what is
+        perpendicular to it, A is the other three rows times U: for a unit quaternion m, that
+        basis is m i, m j and m k.
+        """
+        tilt = right_products(torch.nn.functional.normalize(self.tilts[rows], dim=1))
+        in_time = tilt[:, :, :1] * self.log_durations[rows].exp()[:, None, None]
+        spatial = tilt[:, :, 1:] @ scaled_axes(splats.quats, splats.log_scales)
+        time, space = torch.cat([in_time, spatial], dim=2).split([1, 3], dim=1)
+        variances = time.square().sum(dim=(1, 2)).clamp(min=LEAST_VARIANCE)
+        velocities = (space @ time.mT)[:, :, 0] / variances[:, None]
+        across = left_products(time[:, 0] / variances.sqrt()[:, None])[:, :, 1:]
+        return Slices(variances, velocities, space @ across)
+
+    def _colours(self, since: Tensor, sh: Tensor) -> Tensor:
+        """Return the sum over n of coefficients (N, n, K, 3) times cos(2 pi n (t - mu))."""
+        order = torch.arange(1, sh.shape[1] + 1, device=sh.device)
+        waves = torch.cos(2 * math.pi * since[:, None] * order)
+        summed = waves[:, None] @ sh.flatten(2)
+        return summed.view(len(sh), *sh.shape[2:])
+
+    def begin_at(self, times: Tensor) -> None:
+        """Let splats be seen around the times at which their points were."""
+        take_known(self.times, times)
+
+    def to_split(self) -> Tensor:
+        """Return which splats are long in time (N,)."""
+        return self.log_durations > math.log(self.options.split_duration)
+
+    def scatter(
+        self, children: Tensor, splats: Splats, shrink: float, generator: torch.Generator
+    ) -> None:
+        """Draw the children's times from their parents' extent in time, and make that shorter.
+
+        A child goes along with its parent to its time, so that the four coordinates are drawn from
+        the Gaussian in space and time.
+        """
+        rows = children.nonzero().flatten()
+        slices = self._slices(splats.take(rows), rows)
+        noise = torch.randn(len(rows), generator=generator).to(slices.variances)
+        later = noise * slices.variances.sqrt()
+        self.times[rows] += later
+        splats.means[rows] += later[:, None] * slices.velocities
+        self.log_durations[rows] -= math.log(shrink)
+
+
+def start(
+    options: Options, facts: Facts, splats: Splats, generator: torch.Generator
+) -> Covariance4D:
+    """Return Gaussians that do not move, spread evenly over time."""
+    return Covariance4D(options, splats)
