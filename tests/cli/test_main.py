@@ -49,7 +49,7 @@ def test_help_is_fast_and_lists_every_command() -> None:
     ("words", "expected"),
     [
         ("gsdmsr tr", {"train"}),
-        ("gsdmsr train --preset d", {"default", "dnerf", "dynamic-object"}),
+        ("gsdmsr train --preset gs", {"gsdmsr", "gsdmsr-literal"}),
         ("gsdmsr presets n", {"n3v", "nerfies"}),
         ("gsdmsr export run --format ply-", {"ply-sequence"}),
         ("gsdmsr benchmark scenes s --preset hex", {"hexplane"}),

@@ -167,4 +167,4 @@ def test_the_nearest_nodes_of_the_test_values_are_beyond_doubt() -> None:
     squares = (points[:, None].double() - control_points).square().sum(dim=2).sort(dim=1).values
     gaps = squares[:, check._NEAR] - squares[:, check._NEAR - 1]
     assert (gaps / squares[:, check._NEAR]).min() > 1e-5
-    assert len(OPERATIONS) == 14
+    assert len(OPERATIONS) == 15
