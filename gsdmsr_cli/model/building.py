@@ -24,6 +24,7 @@ def start_model(
     generator: torch.Generator,
     moving: int | None = None,
     precision: str = "float32",
+    times: Tensor | None = None,
 ) -> Model:
     """Make a model of splats whose layers begin anew.
 
@@ -35,6 +36,7 @@ def start_model(
         generator: source of random choices.
         moving: how many splats move; all if None.
         precision: see ``Model``.
+        times: (N,) at which the splats were seen, see ``Layer.begin_at``.
 
     Raises:
         UsageError: there is no such motion or layer, or an option is unknown or out of range.
@@ -42,6 +44,8 @@ def start_model(
     begun: dict[str, Layer] = {}
     for key, package, settings in _named(motion, layers):
         begun[key] = start_layer(package, settings, facts, splats, generator)
+        if times is not None:
+            begun[key].begin_at(times)
     return Model(splats, begun, moving, precision)
 
 

@@ -102,7 +102,7 @@ class Layer(ABC):
         """Follow a resize: row i of what is held per splat becomes what row ``rows[i]`` was.
 
         Args:
-            rows: (M,) int64.
+            rows: (M,) int64; those beyond what is held are of splats that begin to move.
             fresh: (M,) bool, rows that are clones or children.
         """
         for parameter in self.parameters():
@@ -159,6 +159,9 @@ class Layer(ABC):
             shrink: by what the children's extents are divided.
             generator: source of random choices.
         """
+
+    def begin_at(self, times: Tensor) -> None:  # noqa: B027  (most have no time of each splat)
+        """Take the times (N,) at which the first splats were seen, NaN where that is not known."""
 
     def reanchor(self, splats: Splats) -> Sequence[str]:
         """Adapt the layer to where the splats are now, since there are others than before.

@@ -193,16 +193,22 @@ class Model:
         Raises:
             ValueError: the row of a splat that moves comes after one of a splat that does not.
         """
-        self.take_moving(rows, fresh, int((rows < self.moving).sum()))
+        moving = int((rows < self.moving).sum())
+        if not (rows[:moving] < self.moving).all():
+            raise ValueError("rows of splats that move come after rows of splats that stand still")
+        self.take_moving(rows, fresh, moving)
 
     def take_moving(self, rows: Tensor, fresh: Tensor, moving: int) -> None:
         """Do what ``take`` does, and let only the first ``moving`` rows move from now on.
 
+        Those among them that have stood still get new rows in layers that have had none of them,
+        see ``Parameter.fill``.
+
         Raises:
-            ValueError: one of these stands still already.
+            IndexError: there is no such row.
         """
-        if not (rows[:moving] < self.moving).all():
-            raise ValueError("rows of splats that move come after rows of splats that stand still")
+        if len(rows) and int(rows.max()) >= len(self.splats):
+            raise IndexError(f"row {int(rows.max())} of {len(self.splats)} splats")
         for parameter in self._parameters[: len(NAMES)]:
             parameter.take(rows)
         self.moving = moving

@@ -6,6 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
+import torch
 from torch import Tensor
 
 Rate = str | tuple[float, float]
@@ -26,12 +27,14 @@ class Parameter:
         per_splat: whether it has a row for each splat; if not, all splats share it.
         rate: the learning rate that it follows; None for a buffer, of any dtype, that is saved but
             not trained.
+        fill: value of a row that is new: of a splat that has stood still and begins to move.
     """
 
     name: str
     tensor: Tensor
     per_splat: bool = False
     rate: Rate | None = None
+    fill: float = 0.0
 
     def __post_init__(self) -> None:
         self.tensor.requires_grad_(self.rate is not None)
@@ -42,8 +45,16 @@ class Parameter:
         self.tensor.grad = None
 
     def take(self, rows: Tensor) -> None:
-        """Make row i what row ``rows[i]`` was; rows is (M,) int64."""
-        self.set_values(self.tensor.detach()[rows])
+        """Make row i what row ``rows[i]`` was, (M,) int64; a new one where there was none such."""
+        self.set_values(take_rows(self.tensor.detach(), rows, self.fill))
+
+
+def take_rows(tensor: Tensor, rows: Tensor, fill: float) -> Tensor:
+    """Return rows (M,) int64 of a tensor (N, ...), filled with a value where they are N or more."""
+    if not (rows >= len(tensor)).any():
+        return tensor[rows]
+    beyond = tensor.new_full((1, *tensor.shape[1:]), fill)
+    return torch.cat([tensor, beyond])[rows.clamp(max=len(tensor))]
 
 
 def tensors_of(parameters: Iterable[Parameter]) -> dict[str, Tensor]:

@@ -15,7 +15,7 @@ from typing import Any, Literal
 from gsdmsr_cli.backends.cuda.compiler import MOST_VIEWS
 from gsdmsr_cli.ground.errors import UsageError
 from gsdmsr_cli.options import preset_files, strict
-from gsdmsr_cli.options.strict import require
+from gsdmsr_cli.options.strict import require, require_rates
 
 _SECONDS = {"s": 1.0, "m": 60.0, "h": 3600.0}
 _DURATION = "a positive duration such as 90s, 8m or 1.5h"
@@ -207,10 +207,7 @@ class OptimizerOptions:
 
     def __post_init__(self) -> None:
         _require_positive(self, "sh_rest")
-        for rate in fields(self):
-            value = getattr(self, rate.name)
-            ok = rate.name == "sh_rest" or min(value) > 0
-            require(self, rate.name, ok, "[start, end], both above 0")
+        require_rates(self, *(rate.name for rate in fields(self) if rate.name != "sh_rest"))
 
 
 @dataclass(frozen=True)

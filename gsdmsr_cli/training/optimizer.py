@@ -7,6 +7,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
+from gsdmsr_cli.model.parameter import take_rows
 from gsdmsr_cli.ops.adam import Gate, Move, adam_steps
 from gsdmsr_cli.training.state import below
 
@@ -65,11 +66,12 @@ class Adam:
     def take(self, name: str, rows: Tensor, fresh: Tensor) -> None:
         """Follow a resize of the named tensor; rows that are ``fresh`` (M,) start without moments.
 
+        So do rows that the tensor has not had, of splats that begin to move.
         The step count is shared by all rows and goes on.
         """
         for moments in (self.first, self.second):
             if name in moments:
-                taken = moments[name][rows]
+                taken = take_rows(moments[name], rows, 0.0)
                 taken[fresh] = 0
                 moments[name] = taken
 

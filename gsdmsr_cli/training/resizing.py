@@ -37,6 +37,8 @@ class Resize:
         splats: M splats, the values that the rows begin with; those of their parents if None.
         still: (M,) bool, rows that stand still from now on; those whose parents do, if None.
         split: (M,) bool, rows that are children of a split, which layers tell apart as well.
+        moving: (M,) bool, rows that move from now on, though their parents have stood still; none
+            if None.
     """
 
     rows: Tensor
@@ -44,6 +46,7 @@ class Resize:
     splats: Splats | None = None
     still: Tensor | None = None
     split: Tensor | None = None
+    moving: Tensor | None = None
 
 
 def kept(rows: Tensor) -> Resize:
@@ -64,6 +67,8 @@ def resize_model(
     still = rows >= model.moving
     if change.still is not None:
         still |= change.still
+    if change.moving is not None:
+        still &= ~change.moving
     order = still.to(torch.uint8).argsort(stable=True)
     rows, fresh = rows[order], fresh[order]
     model.take_moving(rows, fresh, len(rows) - int(still.sum()))
@@ -125,7 +130,10 @@ class Population:
         count = len(change.rows)
         if count > max(self.cap, len(self.model.splats)):
             raise GsdmsrError(f"{count} splats are more than density.cap, {self.cap}; raise it")
+        held = self.model.moving
         rows, fresh = resize_model(self.model, change, self.generator)
+        if (rows[: self.model.moving] >= held).any():  # what has begun to move has no average
+            self.average.clear()
         for parameter in self.model.parameters():
             if parameter.per_splat:
                 count = len(parameter.tensor)  # of those that move alone, for some

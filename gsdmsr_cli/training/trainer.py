@@ -82,13 +82,13 @@ class Trainer:
         self.workers = WorkerPool(self.renderer)
         self.generator = torch.Generator().manual_seed(preset.training.seed)
         background = torch.tensor(BACKGROUNDS[preset.data.background])
-        splats = initial_splats(
+        splats, times = initial_splats(
             scene, preset.splats, pictures, background, self.generator, preset.density.cap
         )
         self.facts = facts_of(scene, splats)
         model = start_model(
             splats, preset.motion, preset.layers, self.facts, self.generator,
-            precision=preset.training.precision,
+            precision=preset.training.precision, times=times,
         )  # fmt: skip
         self.optimizer = Adam()
         self.saliency = Saliency(len(splats), preset.saliency, device)

@@ -24,6 +24,7 @@ from gsdmsr_cli.ground.errors import DataError
 from gsdmsr_cli.model import motion as motions
 from gsdmsr_cli.model.building import load_model
 from gsdmsr_cli.model.model import MOTION, MOVING, STORED, Model
+from gsdmsr_cli.training.resizing import Resize, resize_model
 
 COUNT = 9
 
@@ -58,9 +59,10 @@ def test_what_is_saved_comes_back_the_same(name: str) -> None:
     model = moving_model(name)
     loaded = loaded_from(saved(model), name)
     assert list(loaded.tensors()) == list(model.tensors())
+    trained = model.trained()
     for what, tensor in loaded.tensors().items():
         assert torch.equal(tensor, model.tensors()[what]), what
-        assert tensor.requires_grad, what
+        assert tensor.requires_grad == (what in trained), what
     for time in (0.0, 0.37, 1.0):
         moved, expected = splats_at(loaded, time), splats_at(model, time)
         for what, tensor in moved.tensors().items():
@@ -99,18 +101,17 @@ def test_take_resizes_splats_and_motion_alike(name: str) -> None:
     moved = splats_at(model, 0.4)
     for what, tensor in moved.tensors().items():
         torch.testing.assert_close(tensor, expected.tensors()[what], atol=1e-6, rtol=1e-6)
+    trained = model.trained()
     for what, tensor in model.tensors().items():
-        assert tensor.is_leaf and tensor.requires_grad and tensor.is_contiguous(), what
+        assert tensor.is_leaf and tensor.is_contiguous(), what
+        assert tensor.requires_grad == (what in trained), what
 
 
-HELD = {
-    "covariance_4d": ["times", "log_durations", "tilts"],
-    "multiscale": ["embeddings"],
-    "polynomial_fourier": [
-        "log_time_scales", "time_centres", "means", "quats", "log_scales", "colours",
-    ],
-}  # fmt: skip
-"""What motions hold for each splat that moves."""
+def held_per_splat(name: str) -> list[str]:
+    """Return the names of what a motion holds for each splat that moves."""
+    parameters = started(name, COUNT).parameters()
+    return [f"{MOTION}.{parameter.name}" for parameter in parameters if parameter.per_splat]
+
 
 STILL_ROWS = torch.tensor([False, True, True, False, False, True, False, False, True])
 ORDER = [0, 3, 4, 6, 7, 1, 2, 5, 8]
@@ -163,7 +164,7 @@ def test_what_stands_still_follows_a_resize(name: str) -> None:
         torch.testing.assert_close(tensor, expected.tensors()[what], atol=1e-6, rtol=1e-6)
     for what in held_by_motion:
         assert len(model.tensors()[what]) == 3, what
-    assert held_by_motion == [f"motion.{what}" for what in HELD.get(name, ())]
+    assert held_by_motion == held_per_splat(name)
 
 
 def test_splats_that_move_come_first() -> None:
@@ -204,6 +205,40 @@ def test_how_many_move_is_saved(name: str) -> None:
     assert torch.equal(splats_at(loaded, 0.6).means, splats_at(model, 0.6).means)
     with pytest.raises(DataError, match="10 of 9 splats move"):
         loaded_from({**tensors, MOVING: torch.tensor(10)}, name)
+
+
+@every_motion
+def test_what_has_stood_still_can_begin_to_move(name: str) -> None:
+    """In new rows of the motion, which is nowhere yet; all others stay what they were."""
+    model, _ = with_still_splats(name)
+    before = splats_at(model, 0.3).map(lambda tensor: tensor.detach().clone())
+    rows, fresh = resize_model(model, Resize(torch.arange(COUNT), none_fresh(torch.arange(COUNT)),
+                                             moving=torch.arange(COUNT) == 7))  # fmt: skip
+    assert rows.tolist() == [0, 1, 2, 3, 4, 7, 5, 6, 8] and model.moving == 6
+    assert not fresh.any()
+    after = splats_at(model, 0.3)
+    old = torch.tensor([0, 1, 2, 3, 4, 6, 7, 8])
+    for what, tensor in after.tensors().items():
+        expected = before.tensors()[what][rows]
+        torch.testing.assert_close(tensor[old], expected[old], atol=1e-6, rtol=1e-6)
+        assert tensor.isfinite().all(), what
+    held = [model.tensors()[what] for what in held_per_splat(name)]
+    assert all(len(tensor) == 6 for tensor in held)
+    with torch.no_grad():
+        for tensor in held:
+            tensor[5] += torch.linspace(0.1, 0.9, tensor[5].numel()).view(tensor[5].shape)
+    if held:
+        assert not torch.equal(*(splats_at(model, time).means[5] for time in (0.1, 0.8)))
+    stand_still(model, torch.ones(COUNT, dtype=torch.bool), splats_at(model, 0.5))
+    everything = torch.ones(COUNT, dtype=torch.bool)
+    resize_model(model, Resize(torch.arange(COUNT), ~everything, moving=everything))
+    assert model.moving == COUNT and splats_at(model, 0.7).means.isfinite().all()
+
+
+def test_a_row_that_is_not_there_is_refused() -> None:
+    model, _ = with_still_splats("static")
+    with pytest.raises(IndexError, match=r"^row 9 of 9 splats$"):
+        model.take(torch.tensor([0, 9]), none_fresh(torch.arange(2)))
 
 
 @every_motion
@@ -327,7 +362,7 @@ def test_tensors_are_the_same_objects_for_good(name: str) -> None:
     model.take(torch.tensor([8, 0, 0, 3]), FRESH)
     stand_still(model, ~FRESH, model.splats.detach())
     model.become(7, 5)
-    held = {f"motion.{what}" for what in HELD.get(name, ())}
+    held = held_per_splat(name)
     fewer = {what: t[:5] if what in held else t for what, t in saved(moving_model(name)).items()}
     model.restore(fewer)
     model.to("cpu")
@@ -352,7 +387,7 @@ def test_only_rows_of_the_mask_pass_their_gradients_through_the_motion(
         """Of a sum of squares over some of the rows."""
         moved = splats_at(model, 0.4, mask)
         loss = torch.stack([t[rows].square().sum() for t in moved.tensors().values()]).sum()
-        given = model.tensors()
+        given = model.trained()
         found = torch.autograd.grad(loss, list(given.values()), materialize_grads=True)
         return dict(zip(given, found, strict=True))
 

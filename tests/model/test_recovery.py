@@ -74,10 +74,100 @@ CENTRES = torch.linspace(0.2, 0.8, COUNT)
 HALF_LIFE = SPAN * math.sqrt(2 * math.log(2))
 """Time after which half of the opacity is left."""
 
+
+def along_a_cubic(means: Tensor, time: float) -> Tensor:
+    """Every splat goes along a cubic of its own, out, back and out again."""
+    ways = 0.25 * torch.nn.functional.normalize(means.roll(1, dims=1), dim=1)
+    across = 0.25 * torch.nn.functional.normalize(means.roll(2, dims=1), dim=1)
+    u = 2 * time - 1
+    return means + (4 * u**3 - 3 * u) / 2 * ways + (u * u - 0.5) * across
+
+
+SPANS = torch.stack([torch.linspace(0.15, 0.85, COUNT), torch.linspace(0.2, 0.35, COUNT)], dim=1)
+"""When each splat is most opaque, and after which time 1 / e of that is left."""
+
+
+def seen_for_a_while(splats: Splats, time: float) -> Moment:
+    """Every splat goes along a cubic and is opaque around a time of its own."""
+    centres, durations = SPANS.unbind(1)
+    opacities = splats.logit_opacities.sigmoid() * torch.exp(-(((time - centres) / durations) ** 2))
+    means = along_a_cubic(splats.means, time)
+    return Moment(replace(splats, means=means, logit_opacities=opacities.logit()))
+
+
+KEYS = torch.randn(COUNT, 7, 3, generator=torch.Generator().manual_seed(4)) / 10
+"""Of each splat how far it is from its place at keyframes a quarter of the time apart, from one
+before the first moment to one after the last."""
+
+
+def through_keyframes(means: Tensor, time: float) -> Tensor:
+    """Every splat goes through keyframes of its own, on cubics with tangents across neighbours."""
+    before = min(int(4 * time), 3)
+    u, y = 4 * time - before, KEYS[:, before : before + 4].unbind(1)
+    first, last = (y[2] - y[0]) / 2, (y[3] - y[1]) / 2
+    smooth = 3 * u**2 - 2 * u**3
+    bends = (u**3 - 2 * u**2 + u) * first + (u**3 - u**2) * last
+    return means + (1 - smooth) * y[1] + smooth * y[2] + bends
+
+
+PRESENCE = torch.stack([torch.linspace(0.1, 0.4, COUNT), torch.linspace(0.6, 0.9, COUNT)], dim=1)
+"""Between which times each splat is there; it appears and vanishes as a Gaussian of 0.15 does."""
+
+
+def there_between_two_times(splats: Splats, time: float) -> Moment:
+    """Every splat goes through keyframes, appears and vanishes."""
+    outside = (PRESENCE[:, 0] - time).relu() + (time - PRESENCE[:, 1]).relu()
+    opacities = splats.logit_opacities.sigmoid() * torch.exp(-((outside / 0.15) ** 2))
+    means = through_keyframes(splats.means, time)
+    return Moment(replace(splats, means=means, logit_opacities=opacities.logit()))
+
+
+def lives_between(times: Tensor, duration: float) -> Tensor:
+    """Return from when until when opacities with two Gaussian ends are above half of the most."""
+    half = duration * math.log(2) ** 0.5
+    return (times + half * torch.tensor([-1.0, 1.0])).clamp(0, 1)
+
+
+def lives_around(centres: Tensor, durations: Tensor) -> Tensor:
+    """Return from when until when Gaussian opacities are above half of the most, within [0, 1]."""
+    half = durations * math.log(2) ** 0.5
+    return torch.stack([centres - half, centres + half], dim=1).clamp(0, 1)
+
+
 CASES = {
     "control_points": Case(
         {"name": "control_points", "count": 16, "neighbours": 4, "time_ratio": 0.5},
         moved(along_an_arc),
+    ),
+    "polynomial": Case(
+        {"name": "polynomial", "rate": [2e-2, 1e-4]},
+        moved(along_a_cubic),
+        steps=400,
+        options=["optimizer.means=[5e-3,1e-5]"],
+    ),
+    "temporal_opacity": Case(
+        {"name": "polynomial", "rate": [2e-2, 1e-4]},
+        seen_for_a_while,
+        steps=1200,
+        layers=[{"name": "temporal_opacity", "centre_rate": [1e-2, 1e-4]}],
+        options=["optimizer.means=[5e-3,1e-5]"],
+        lives=lives_around(*SPANS.unbind(1)),
+    ),
+    "keyframes": Case(
+        {"name": "keyframes", "keyframes": 5, "rate": [1e-2, 1e-4]}, moved(through_keyframes)
+    ),
+    "life_span": Case(
+        {"name": "keyframes", "keyframes": 5, "rate": [1e-2, 1e-4]},
+        there_between_two_times,
+        layers=[{"name": "life_span", "centre_rate": [1e-2, 1e-4]}],
+        steps=1200,
+        lives=lives_between(PRESENCE, 0.15),
+    ),
+    "drift": Case(
+        {"name": "static"},
+        moved(each_its_own_way),
+        layers=[{"name": "drift", "rate": [1e-2, 1e-4]}],
+        steps=300,
     ),
     "multiscale": Case(
         {"name": "multiscale", "coarse_until": 0.0, "time_ratio": 0.5}, moved(each_its_own_way)
@@ -122,7 +212,7 @@ CASES = {
         steps=1500,
     ),
 }
-"""By the names of the motions; each has the trajectory that the motion is made for."""
+"""By the names of motions or layers; each has the trajectory that these are made for."""
 
 
 @pytest.mark.parametrize("case", CASES.values(), ids=CASES)

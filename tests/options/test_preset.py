@@ -40,6 +40,7 @@ def test_the_presets_ship() -> None:
     names = {"default", "dnerf", "hexplane", "static", "4dgs", "gsdmsr", "gsdmsr-literal"}
     names |= {"video", "nerfies", "hypernerf", "n3v", "dynamic-object", "grid4d", "dual-domain"}
     names |= {"4d-covariance"}
+    names |= {"spacetime", "spacetime-lite", "ex4dgs"}
     assert names <= set(preset_files.preset_names())
 
 

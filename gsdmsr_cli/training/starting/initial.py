@@ -16,7 +16,7 @@ from gsdmsr_cli.options.preset import SplatOptions
 from gsdmsr_cli.scene.pictures import Pictures
 from gsdmsr_cli.scene.scene import Scene
 from gsdmsr_cli.training.starting import silhouettes, surfaces
-from gsdmsr_cli.training.starting.sightings import Points, colours_of
+from gsdmsr_cli.training.starting.sightings import Points, at_unknown_times, colours_of
 
 NEIGHBOURS = 3
 
@@ -32,8 +32,10 @@ def initial_splats(
     background: Tensor,
     generator: torch.Generator,
     most: int,
-) -> Splats:
+) -> tuple[Splats, Tensor]:
     """Return isotropic splats as large as the distance to their neighbours (3DGS, section 5.1).
+
+    With them come the times (N,) at which they were seen, NaN where that is not known.
 
     They sit at the scene's own points, or at ``most`` of them chosen at random. Where there are
     none, or the start is "surfaces" and there are fewer than ``options.count``, others join them as
@@ -45,19 +47,20 @@ def initial_splats(
     if not len(given.means) or (options.start == "surfaces" and wanted > 0):
         more = _new_points(scene, options.start, wanted, pictures, background, generator)
         given = Points(*map(torch.cat, zip(given, more, strict=True)))
-    means, colours = given
+    means, colours, times = given
     n = len(means)
     sh = torch.zeros(n, (options.sh_degree + 1) ** 2, 3)
     sh[:, 0] = (colours - 0.5) / SH_C0
     quats = torch.zeros(n, 4)
     quats[:, 0] = 1
-    return Splats(
+    splats = Splats(
         means=means,
         quats=quats,
         log_scales=_spacing(means, scene.bound).log()[:, None].repeat(1, 3),
         logit_opacities=torch.full((n,), math.log(options.opacity / (1 - options.opacity))),
         sh=sh,
     )
+    return splats, times
 
 
 def _given_points(
@@ -69,8 +72,8 @@ def _given_points(
     if len(means) > most:
         chosen = torch.randperm(len(means), generator=generator)[:most].sort().values
     if scene.colours is None:
-        return Points(means[chosen], colours_of(means[chosen], scene, pictures))
-    return Points(means[chosen], torch.from_numpy(scene.colours)[chosen])
+        return at_unknown_times(means[chosen], colours_of(means[chosen], scene, pictures))
+    return at_unknown_times(means[chosen], torch.from_numpy(scene.colours)[chosen])
 
 
 def _new_points(
@@ -86,7 +89,7 @@ def _new_points(
     if start == "surfaces":
         return surfaces.sample_points(scene, pictures, count, generator)
     means = (2 * torch.rand(count, 3, generator=generator) - 1) * scene.bound
-    return Points(means, 0.5 + SH_C0 * torch.rand(count, 3, generator=generator) / 255)
+    return at_unknown_times(means, 0.5 + SH_C0 * torch.rand(count, 3, generator=generator) / 255)
 
 
 def _spacing(means: Tensor, bound: float) -> Tensor:

@@ -21,10 +21,17 @@ class Points(NamedTuple):
     Attributes:
         means: (P, 3) [world units].
         colours: (P, 3) in [0, 1].
+        times: (P,) at which they were seen, in [0, 1]; NaN where that is not known.
     """
 
     means: Tensor
     colours: Tensor
+    times: Tensor
+
+
+def at_unknown_times(means: Tensor, colours: Tensor) -> Points:
+    """Return points of which it is not known when they were seen."""
+    return Points(means, colours, torch.full((len(means),), torch.nan))
 
 
 def places(points: Tensor, camera: Camera) -> tuple[Tensor, Tensor, Tensor]:

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from gsdmsr_cli.scene.pictures import Pictures
 from gsdmsr_cli.scene.scene import Scene
-from gsdmsr_cli.training.starting.sightings import Points, places
+from gsdmsr_cli.training.starting.sightings import Points, at_unknown_times, places
 
 CANDIDATES, MOST_CANDIDATES = 20, 500_000
 """Random points per point wanted, and how many at most, for the sake of memory."""
@@ -65,4 +65,5 @@ def sample_points(
     means = candidates[rows] + spacing * (torch.rand(count, 3, generator=generator) - 0.5)
     means = means.clamp(-scene.bound, scene.bound)
     mean_colours = colours / inside.clamp(min=1)[:, None]
-    return Points(means, torch.where(inside[rows, None] > 0, mean_colours[rows], 0.5))
+    own = torch.where(inside[rows, None] > 0, mean_colours[rows], 0.5)
+    return at_unknown_times(means, own)

@@ -65,7 +65,8 @@ def sample_points(
     found = [_sweep(album, sender, rays, generator) for sender in senders]
     means, colours, clearness = (torch.cat(parts) for parts in zip(*found, strict=True))
     rows = torch.multinomial(clearness + 1e-6, count, generator=generator)
-    return Points(means[rows], colours[rows])
+    times = torch.tensor([album.time(sender) for sender in senders]).repeat_interleave(rays)
+    return Points(means[rows], colours[rows], times[rows])
 
 
 class _Album:
@@ -89,6 +90,10 @@ class _Album:
 
     def __len__(self) -> int:
         return len(self._views)
+
+    def time(self, row: int) -> float:
+        """Return the time of a view."""
+        return self._views[row].time
 
     def partners(self, row: int) -> list[int]:
         """Return the views to compare a view with."""

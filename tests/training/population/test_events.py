@@ -15,9 +15,9 @@ def preset_of(*options: str) -> Preset:
     return load_preset("dnerf", None, options)
 
 
-def test_a_preset_has_every_event_of_the_folder_unless_it_says_otherwise() -> None:
+def test_a_preset_has_the_events_of_every_training_unless_it_says_otherwise() -> None:
     assert list(start_events(preset_of())) == list(EVENTS)
-    assert sorted(EVENTS) == plugins.names(population.__name__)
+    assert set(EVENTS) < set(plugins.names(population.__name__))
 
 
 def test_events_are_asked_in_the_order_of_the_list() -> None:

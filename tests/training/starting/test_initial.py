@@ -28,10 +28,13 @@ def scene_of(points: np.ndarray | None = None, bound: float = BOUND) -> Scene:
 
 
 def start(scene: Scene, seed: int = 0, most: int = 10_000, **options: Any) -> Splats:
-    """Return the splats of a scene without pictures."""
+    """Return the splats of a scene without pictures, of which no time is known."""
     chosen = SplatOptions(**{"start": "box", **options})
     pictures = Pictures((1.0, 1.0, 1.0), 1, 0)
-    return initial_splats(scene, chosen, pictures, torch.ones(3), generator(seed), most)
+    given = chosen, pictures, torch.ones(3), generator(seed), most
+    splats, times = initial_splats(scene, *given)
+    assert times.shape == (len(splats),) and times.isnan().all()
+    return splats
 
 
 def grid_of(step: float, offset: float = 0.0) -> np.ndarray:

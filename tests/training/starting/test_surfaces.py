@@ -105,18 +105,34 @@ def test_pixels_that_do_not_count_send_no_rays(tmp_path: Path) -> None:
     assert (points.means[:, 0] < 0.4).float().mean() > 0.95
 
 
+def test_points_are_of_the_time_of_the_view_that_sent_their_rays() -> None:
+    """A view that looks at half of the wall sends no rays to the other one."""
+    scene, _ = capture(2)
+    left, right = (replace(v.camera, cx=cx) for v, cx in zip(scene.views, (148, -52), strict=True))
+    views = tuple(replace(v, camera=c) for v, c in zip(scene.views, (left, right), strict=True))
+    album = Album([photograph(left), photograph(right)])
+    points = sample_points(replace(scene, views=views), album, 100, generator(0))
+    assert set(points.times.tolist()) == {0.0, 1.0}
+    for time, camera in enumerate((left, right)):
+        assert places(points.means[points.times == time], camera)[2].all()
+        assert not places(points.means[points.times != time], camera)[2].all()
+
+
 def test_surfaces_join_points_that_are_too_few() -> None:
+    """Of which alone it is known when they were seen."""
     scene, pictures = capture(5)
     few = np.array([[0, WALL, 0], [0.1, WALL, 0]], np.float32)
     scene = replace(scene, points=few, colours=np.full((2, 3), 0.25, np.float32))
     for count, total in ((40, 40), (2, 2), (1, 2)):
         options = SplatOptions(start="surfaces", count=count)
-        splats = initial_splats(scene, options, pictures, torch.ones(3), generator(0), 100)
+        splats, times = initial_splats(scene, options, pictures, torch.ones(3), generator(0), 100)
         assert len(splats) == total
+        assert times.isfinite().tolist() == [False] * 2 + [True] * (total - 2)
         assert torch.equal(splats.means[:2], torch.from_numpy(few))
         assert (SH_C0 * splats.sh[:2, 0] + 0.5).numpy() == pytest.approx(0.25)
     options = SplatOptions(start="box", count=40)
-    assert len(initial_splats(scene, options, pictures, torch.ones(3), generator(0), 100)) == 2
+    splats, _ = initial_splats(scene, options, pictures, torch.ones(3), generator(0), 100)
+    assert len(splats) == 2
 
 
 def test_the_seed_decides() -> None:
