@@ -43,11 +43,11 @@ def started(name: str, count: int = 1, /, **options: Any) -> Layer:
 
 
 def disturbed(motion: Layer) -> Layer:
-    """Return the motion in its last phase, with every tensor moved away from its start."""
+    """Return the motion in its last phase, with all that is trained moved away from its start."""
     motion.advance(1.0)
     rng = generator(1)
     with torch.no_grad():
-        for tensor in motion.tensors().values():
+        for tensor in (p.tensor for p in motion.parameters() if p.rate is not None):
             tensor += 0.1 * torch.randn(tensor.shape, generator=rng)
     return motion
 

@@ -68,11 +68,11 @@ class Layer(ABC):
         shades: whether ``shade`` does anything.
     """
 
-    identity_at_start: ClassVar[bool] = True
+    identity_at_start: bool = True
     concerns_still: ClassVar[bool] = False
     before_motion: ClassVar[bool] = False
     needs_camera: ClassVar[bool] = False
-    needs_jitter: ClassVar[bool] = False
+    needs_jitter: bool = False
     shades: ClassVar[bool] = False
 
     def __init__(self, parameters: Sequence[Parameter] = ()) -> None:

@@ -96,6 +96,11 @@ class Adam:
             self.second[name].zero_()
             self.steps[name] = self.restarts[name] = 0
 
+    def forget(self, name: str) -> None:
+        """Drop all that is kept of a tensor which is not trained any more."""
+        for kept in (self.first, self.second, self.steps, self.restarts):
+            kept.pop(name, None)
+
     def tensors(self) -> dict[str, Tensor]:
         """Return the moments by name; the step counts are numbers, to be kept elsewhere."""
         first = {_FIRST + name: tensor for name, tensor in self.first.items()}

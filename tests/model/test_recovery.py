@@ -134,6 +134,12 @@ def lives_around(centres: Tensor, durations: Tensor) -> Tensor:
     return torch.stack([centres - half, centres + half], dim=1).clamp(0, 1)
 
 
+def along_two_arcs(means: Tensor, time: float) -> Tensor:
+    """Every other splat goes round one way, the others the other way: two rigid bodies."""
+    other = (torch.arange(len(means)) % 2 == 1)[:, None]
+    return torch.where(other, along_an_arc(means, 1 - time), along_an_arc(means, time))
+
+
 CASES = {
     "control_points": Case(
         {"name": "control_points", "count": 16, "neighbours": 4, "time_ratio": 0.5},
@@ -168,6 +174,26 @@ CASES = {
         moved(each_its_own_way),
         layers=[{"name": "drift", "rate": [1e-2, 1e-4]}],
         steps=300,
+
+
+    "network_control_points": Case(
+        {
+            "name": "network_control_points",
+            "count": 16,
+            "neighbours": 4,
+            "alone_until": 0.4,
+            "depth": 4,
+            "position_octaves": 2,
+            "time_octaves": 2,
+        },
+        moved(along_an_arc),
+        options=("optimizer.network=[0.005,1e-5]",),
+        steps=1000,
+    ),
+    "rigid_groups": Case(
+        {"name": "rigid_groups", "count": 2, "rate": [0.015, 3e-5]},
+        moved(along_two_arcs),
+        steps=1000,
     ),
     "multiscale": Case(
         {"name": "multiscale", "coarse_until": 0.0, "time_ratio": 0.5}, moved(each_its_own_way)

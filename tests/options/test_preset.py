@@ -41,6 +41,7 @@ def test_the_presets_ship() -> None:
     names |= {"video", "nerfies", "hypernerf", "n3v", "dynamic-object", "grid4d", "dual-domain"}
     names |= {"4d-covariance"}
     names |= {"spacetime", "spacetime-lite", "ex4dgs"}
+    names |= {"sc-gs", "speedy"}
     assert names <= set(preset_files.preset_names())
 
 

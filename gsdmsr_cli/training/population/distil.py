@@ -1,0 +1,97 @@
+"""Lets a motion of rigid groups take over from the motion that has been trained so far.
+
+GroupFlow of SpeeDe3DGS (Tu et al., CVPR 2026): half way through a training its trajectories are
+clustered, and what is drawn from then on, and trained, is one rigid movement per group.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+
+from gsdmsr_cli.ground.errors import UsageError
+from gsdmsr_cli.model.distilling import Distilling
+from gsdmsr_cli.model.model import STORED
+from gsdmsr_cli.options.preset import Preset
+from gsdmsr_cli.options.strict import require
+from gsdmsr_cli.training.population import Event, Tick
+from gsdmsr_cli.training.resizing import Population
+
+
+@dataclass(frozen=True)
+class Options:
+    """Settings.
+
+    Attributes:
+        at: progress at which it happens; best after splats have ceased to grow.
+    """
+
+    at: float = 0.5
+
+    def __post_init__(self) -> None:
+        require(self, "at", 0 <= self.at <= 1, "a progress from 0 to 1")
+
+
+class Distil(Event):
+    """Happens once, when the splats move.
+
+    Attributes:
+        done: whether it has happened.
+    """
+
+    def __init__(self, options: Options) -> None:
+        self.options, self.done = options, False
+
+    def due(self, tick: Tick) -> bool:
+        """Return whether the progress has been reached."""
+        return not self.done and tick.progress >= self.options.at
+
+    @torch.no_grad()
+    def apply(self, population: Population, tick: Tick) -> None:
+        """Let layers take over, and splats have the canonical values that these want."""
+        if not population.moving:
+            return
+        self.done = True
+        model, optimizer = population.model, population.optimizer
+        splats, moving = model.splats.detach(), slice(0, model.moving)
+        for key, layer in model.layers.items():
+            if isinstance(layer, Distilling):
+                own, dropped = layer.distil(splats.map(lambda tensor: tensor[moving]))
+                for name, values in own.tensors().items():
+                    splats.tensors()[name][moving] = values
+                for name in dropped:
+                    optimizer.forget(f"{key}.{name}")
+        for name in STORED:
+            optimizer.reset_moments(name, second=False)
+        population.average.clear()
+
+    def state(self) -> dict[str, Any]:
+        """Return whether it has happened."""
+        return {"done": self.done}
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Return to what ``state`` returned."""
+        self.done = bool(state["done"])
+
+
+def start(options: Options, preset: Preset) -> Distil:
+    """Return the event.
+
+    Raises:
+        UsageError: the preset's motion has no base to take over from, or more groups than there
+            may be splats.
+    """
+    motion = preset.motion
+    if not motion.get("base"):
+        raise UsageError(
+            f"events names 'distil', but the motion '{motion['name']}' has no base to take over "
+            "from; write motion: {name: rigid_groups, base: {name: "
+            f"{motion['name']}}}}}"
+        )
+    groups, most = motion.get("count", 0), preset.density.cap
+    if groups > most:
+        raise UsageError(f"motion.count is {groups}; allowed: at most density.cap, which is {most}")
+    return Distil(options)
