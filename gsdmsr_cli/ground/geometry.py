@@ -84,6 +84,20 @@ def nearest_quats(matrices: Tensor) -> Tensor:
     return torch.where(nowhere, largest.new_tensor([1.0, 0.0, 0.0, 0.0]), largest)
 
 
+def as_rigid_as_possible(after: Tensor, before: Tensor, weights: Tensor) -> Tensor:
+    """Return |after - R before|^2 (S, K) with the rotation R of each neighbourhood that fits best.
+
+    Sorkine & Alexa (SGP 2007), equation 3. The energy has no gradient by its best rotation.
+
+    Args:
+        after, before: (S, K, 3) ways from a point to its K neighbours.
+        weights: (S, K) of the neighbours in the fit.
+    """
+    with torch.no_grad():
+        turns = quat_to_rotmat(nearest_quats((weights[:, :, None] * after).mT @ before))
+    return (after - before @ turns.mT).square().sum(dim=2)
+
+
 def scaled_axes(quats: Tensor, log_scales: Tensor) -> Tensor:
     """Return the (N, 3, 3) matrices R diag(exp(log_scales)), whose columns are axes [world units].
 

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from gsdmsr_cli.gaussians.splats import Splats
-from gsdmsr_cli.ground.geometry import nearest_quats, quat_to_rotmat
+from gsdmsr_cli.ground.geometry import as_rigid_as_possible
 from gsdmsr_cli.training.losses._comparing import any_time
 from gsdmsr_cli.training.losses._neighbours import (
     Neighbourhoods,
@@ -41,11 +41,7 @@ class AsRigidAsPossible(NeighbourTerm):
     def deviations(self, now: Splats, other: Splats, found: Neighbourhoods) -> Tensor:
         """Return the squared lengths (S, K)."""
         after, before = (found.apart(one.means) for one in (now, other))
-        with torch.no_grad():
-            weighted = found.weights[:, :, None] * after
-            turns = quat_to_rotmat(nearest_quats(weighted.mT @ before))
-        taken = before @ turns.mT
-        return (after - taken).square().sum(dim=2) / found.size.square()
+        return as_rigid_as_possible(after, before, found.weights) / found.size.square()
 
 
 def start(options: Options) -> AsRigidAsPossible:

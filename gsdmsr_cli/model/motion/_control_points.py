@@ -1,0 +1,139 @@
+"""What motions share whose splats follow control points: their places, radii and neighbours.
+
+SC-GS (Huang et al., CVPR 2024). How the points themselves move is the motion's own.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Sequence
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from gsdmsr_cli.gaussians.moment import Moment
+from gsdmsr_cli.gaussians.splats import Splats
+from gsdmsr_cli.model.layer import Facts, Instant, Layer
+from gsdmsr_cli.model.parameter import Parameter
+from gsdmsr_cli.ops import skin, spread
+from gsdmsr_cli.ops.nearest import Nearest
+from gsdmsr_cli.options import strict
+
+_POINTS, _LOG_RADII = "control_points", "log_radii"
+
+OPAQUE = 0.1
+"""Control points are placed where splats of this opacity or more are."""
+
+LEAST_SPACING = 1e-3
+"""Least initial radius of a control point, in units of the bound."""
+
+
+def require_points(options: object, count: int, neighbours: int) -> None:
+    """Check how many control points there are, and how many a splat follows.
+
+    Raises:
+        InvalidError: there are too few of either, or a splat follows more than there are.
+    """
+    strict.require(options, "count", count > spread.SPACING_OF, "4 or more")
+    within = 1 <= neighbours <= count
+    strict.require(options, "neighbours", within, f"1 to count, which is {count}")
+
+
+class ControlPoints(Layer):
+    """Control points with radii, whose displacement, rotation and scaling a subclass gives.
+
+    Args:
+        count: number of control points.
+        neighbours: how many of them each splat follows.
+        facts, generator: see ``start_layer``.
+    """
+
+    def __init__(
+        self, count: int, neighbours: int, facts: Facts, generator: torch.Generator
+    ) -> None:
+        self.facts, self._kept = facts, neighbours
+        lower, upper = torch.tensor(facts.box)
+        anywhere = torch.rand(count, 3, generator=generator)
+        self.control_points = spread.spread_out(lower + (upper - lower) * anywhere, count)
+        self.log_radii = self._initial_log_radii(self.control_points)
+        self._search, self._pairs = Nearest(neighbours), Nearest(neighbours)
+        self._near = torch.zeros(0, neighbours, dtype=torch.int32)
+        self._found_for: Tensor | None = None
+        super().__init__(
+            [
+                Parameter(_POINTS, self.control_points, rate="network"),
+                Parameter(_LOG_RADII, self.log_radii, rate="network"),
+            ]
+        )
+
+    def _initial_log_radii(self, points: Tensor) -> Tensor:
+        """Return the logarithms of the radii (M,) that control points (M, 3) begin with."""
+        return spread.spacing(points).clamp(min=LEAST_SPACING * self.facts.bound).log()
+
+    @abstractmethod
+    def _deformation(self, points: Tensor, time: float) -> Tensor:
+        """Return (M, 10) of points (M, 3) at a time in [0, 1], see ``ops.skin.transforms``."""
+
+    def at(self, moment: Moment, instant: Instant) -> Moment:
+        """Return the moved splats."""
+        transforms = self._transforms(self.control_points, instant.time)
+        near = self._neighbours(moment.splats.means)
+        given = self.control_points, self.log_radii, transforms, near
+        return replace(moment, splats=skin.skin(moment.splats, *given))
+
+    def _transforms(self, points: Tensor, time: float) -> Tensor:
+        return skin.transforms(points, self._deformation(points, time))
+
+    def _neighbours(self, means: Tensor) -> Tensor:
+        """Return which control points splats follow, (N, K) int32.
+
+        The search is repeated whenever splats or control points may have changed: always in
+        training, and once for all the moments at which a finished model is drawn.
+        """
+        if torch.is_grad_enabled() or not self._knows(means):
+            self._near = self._search.find(means, self.control_points)
+            # kept, so that no other splats get this memory
+            self._found_for = None if torch.is_grad_enabled() else means.detach()
+        return self._near
+
+    def _knows(self, means: Tensor) -> bool:
+        """Return whether the neighbours that were found last are those of these splats."""
+        known = self._found_for
+        return (
+            known is not None and known.data_ptr() == means.data_ptr() and len(known) == len(means)
+        )
+
+    def reanchor(self, splats: Splats) -> Sequence[str]:
+        """Spread the control points evenly over the present splats that are not transparent.
+
+        What moves them keeps its values, so the motion of splats hardly changes.
+        """
+        finite = splats.means.isfinite().all(dim=1)
+        opaque = finite & (torch.sigmoid(splats.logit_opacities) >= OPAQUE)
+        enough = int(opaque.sum()) >= len(self.control_points)
+        places = splats.means[opaque if enough else finite]
+        if not len(places):
+            return ()
+        points = spread.spread_out(places, len(self.control_points))
+        self.control_points.copy_(points)
+        self.log_radii.copy_(self._initial_log_radii(points))
+        self._found_for = None
+        return _POINTS, _LOG_RADII
+
+    def take(self, rows: Tensor, fresh: Tensor) -> None:
+        """Drop the neighbours that were found; no parameter has a row per splat."""
+        self._found_for = None
+
+    def advance(self, progress: float) -> None:
+        """Drop the neighbours that were found; there are no phases."""
+        self._found_for = None
+
+    def check(self) -> None:
+        """Raise ValueError unless control points and radii fit together."""
+        shape, radii = tuple(self.control_points.shape), len(self.log_radii)
+        if shape != (radii, 3) or radii <= spread.SPACING_OF:
+            raise ValueError(f"{shape} control points, {radii} radii")
+        if radii < self._kept:
+            raise ValueError(f"{radii} control points for {self._kept} neighbours")
+        self._found_for = None
