@@ -174,8 +174,7 @@ CASES = {
         moved(each_its_own_way),
         layers=[{"name": "drift", "rate": [1e-2, 1e-4]}],
         steps=300,
-
-
+    ),
     "network_control_points": Case(
         {
             "name": "network_control_points",
