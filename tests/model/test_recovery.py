@@ -56,14 +56,19 @@ SPAN = 0.13
 """Standard deviation in time for which splats are seen."""
 
 
-def seen_around(times: Tensor) -> Truth:
-    """Return the truth that splats go straight on, and are seen around times of their own."""
+def seen_around(times: Tensor, period: float = math.inf) -> Truth:
+    """Return the truth that splats are seen around times of their own, and swing or go straight on.
+
+    Their velocities at these times are the same; a period without an end is a straight line.
+    """
+    turn = 2 * math.pi / period
 
     def truth(splats: Splats, time: float) -> Moment:
         since = time - times
         ways = torch.nn.functional.normalize(splats.means.roll(1, dims=1), dim=1)
         opacities = splats.logit_opacities.sigmoid() * torch.exp(-(since**2) / (2 * SPAN**2))
-        means = splats.means + 0.5 * since[:, None] * ways
+        way = torch.sin(turn * since) / turn if turn else since
+        means = splats.means + 0.5 * way[:, None] * ways
         return Moment(replace(splats, means=means, logit_opacities=opacities.logit()))
 
     return truth
@@ -73,6 +78,8 @@ CENTRES = torch.linspace(0.2, 0.8, COUNT)
 
 HALF_LIFE = SPAN * math.sqrt(2 * math.log(2))
 """Time after which half of the opacity is left."""
+
+LIVES = torch.stack([CENTRES - HALF_LIFE, CENTRES + HALF_LIFE], dim=1).clamp(0, 1)
 
 
 def along_a_cubic(means: Tensor, time: float) -> Tensor:
@@ -219,7 +226,18 @@ CASES = {
         seen_around(CENTRES),
         options=["optimizer.log_scales=[3e-3,1e-5]", "optimizer.quats=[3e-3,1e-5]"],
         steps=1000,
-        lives=torch.stack([CENTRES - HALF_LIFE, CENTRES + HALF_LIFE], dim=1).clamp(0, 1),
+        lives=LIVES,
+    ),
+    "vibration": Case(
+        {
+            "name": "vibration",
+            "period": 0.8,
+            "smoothing": 0.0,
+            "peak_rate": [1e-2, 1e-4],
+            "life_span_rate": [2e-2, 1e-4],
+        },
+        seen_around(CENTRES, 0.8),
+        lives=LIVES,
     ),
     "polynomial_fourier": Case(
         {"name": "polynomial_fourier", "rate": [1e-2, 1e-4]}, moved(drifting_and_swinging)

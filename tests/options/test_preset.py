@@ -39,8 +39,7 @@ def refusal(name: str | None, config: Path | None, *overrides: str) -> str:
 def test_the_presets_ship() -> None:
     names = {"default", "dnerf", "hexplane", "static", "4dgs", "gsdmsr", "gsdmsr-literal"}
     names |= {"video", "nerfies", "hypernerf", "n3v", "dynamic-object", "grid4d", "dual-domain"}
-    names |= {"4d-covariance"}
-    names |= {"spacetime", "spacetime-lite", "ex4dgs"}
+    names |= {"4d-covariance", "pvg", "spacetime", "spacetime-lite", "ex4dgs"}
     names |= {"sc-gs", "speedy"}
     assert names <= set(preset_files.preset_names())
 
