@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import json
 import os
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
 import cuda_shim
 import pytest
+from datasets import write_picture
 
 from gsdmsr_cli.backends.cuda import availability
-from gsdmsr_cli.demo.synthetic import write_scene
+from gsdmsr_cli.demo.synthetic import draw, solids_at, write_scene
+from gsdmsr_cli.formats import read_scene
 
 
 @pytest.fixture(scope="session")
@@ -31,6 +35,21 @@ def tiny_scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("data") / "tiny"
     write_scene(folder, size=48, train=12, val=3, test=4)
     return folder
+
+
+@pytest.fixture
+def rig(tiny_scene: Path, tmp_path: Path) -> Path:
+    """The tiny scene seen by the first camera alone at all of its moments."""
+    data = tmp_path / "rig"
+    shutil.copytree(tiny_scene, data)
+    layout = data / "transforms_train.json"
+    document = json.loads(layout.read_text())
+    camera = read_scene(data).split("train")[0].camera
+    for frame in document["frames"]:
+        frame["transform_matrix"] = document["frames"][0]["transform_matrix"]
+        write_picture(data / f"{frame['file_path']}.png", draw(solids_at(frame["time"]), camera))
+    layout.write_text(json.dumps(document))
+    return data
 
 
 @pytest.fixture(scope="session")

@@ -14,6 +14,7 @@ from gsdmsr_cli.capture.reconstruction import Reconstruction
 from gsdmsr_cli.ground.files import write_json
 from gsdmsr_cli.ground.progress import OnProgress
 from gsdmsr_cli.scene.native import cv2
+from gsdmsr_cli.scene.optical_flow import Grey, ends_of, optical_flow, trusted
 
 LONGEST = 640
 """Longer side at which flow is computed [px]."""
@@ -29,9 +30,6 @@ INCONSISTENT = 1.5
 
 SMALLEST = 0.002
 """Smaller patches, as shares of the picture, are mistakes."""
-
-Grey = NDArray[np.uint8]
-Floats32 = NDArray[np.float32]
 
 
 def write_found_masks(
@@ -81,23 +79,13 @@ def _off_lines(
     0 where the flow is not to be trusted.
     """
     height, width = here.shape
-    forward, back = _flow(here, there), _flow(there, here)
-    columns, rows = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height))
-    to_x = columns + forward[..., 0]
-    to_y = rows.astype(np.float32) + forward[..., 1]
-    returned = forward + cv2.remap(back, to_x, to_y, cv2.INTER_LINEAR)
-    inside = (to_x >= 0) & (to_x <= width - 1) & (to_y >= 0) & (to_y <= height - 1)
-    trusted = inside & (np.linalg.norm(returned, axis=2) < INCONSISTENT)
+    forward, back = optical_flow(here, there), optical_flow(there, here)
+    to_x, to_y = ends_of(forward)
     seen = cv2.remap(rays.astype(np.float32), to_x, to_y, cv2.INTER_LINEAR)
     distances = sampson_distance(
         essential, rays.reshape(-1, 2), np.asarray(seen, np.float64).reshape(-1, 2)
     )
-    return np.where(trusted, distances.reshape(height, width), 0.0)
-
-
-def _flow(here: Grey, there: Grey) -> Floats32:
-    dis = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
-    return np.asarray(dis.calc(here, there, None), dtype=np.float32)  # type: ignore[call-overload]
+    return np.where(trusted(forward, back, INCONSISTENT), distances.reshape(height, width), 0.0)
 
 
 def _cleaned(moving: Mask) -> Mask:

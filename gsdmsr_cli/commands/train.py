@@ -56,6 +56,8 @@ def run(request: Request) -> None:
         scene, load_s = _timed(lambda: _read(request))
         beginning.suit(scene)
         trainer, prepare_s = _timed(lambda: _prepare(scene, beginning.options, device))
+        for text in trainer.renderer.notes:
+            say.note(text)
         if request.dry_run:
             require_apart(request.out, scene)
             beginning.restore(trainer)
@@ -77,6 +79,7 @@ def _train(
     with trainer:
         beginning.restore(trainer)
         folder = beginning.open_folder(trainer)
+        trainer.renderer.cache_in(folder.root)
         timings = {"load_s": load_s, "compile_s": _start_work(trainer, device)}
         processes, began = len(trainer.workers), trainer.clock.step
         with TrainingDisplay() as display, observing(observers, folder, began) as hand_on:

@@ -30,10 +30,22 @@ def draw_flow(
         next_camera: of the next moment, whose pictures have the same size.
         engine: draws the displacements as if they were colours.
     """
+    return blend_motion(screen_motion(moment, camera, later, next_camera), moment, camera, engine)
+
+
+def screen_motion(moment: Moment, camera: Camera, later: Moment, next_camera: Camera) -> Tensor:
+    """Return the (N, 2) displacements of the splats' centres on the screen [px].
+
+    Arguments as in ``draw_flow``. What goes far out of the picture goes no further than its sides.
+    """
     moved = project(later.splats.means, next_camera) - project(moment.splats.means, camera)
     most = float(camera.width + camera.height)
-    moved = torch.nan_to_num(moved).clamp(-most, most)
-    scale = max(float(moved.abs().max()) if len(moved) else 0.0, 1e-6)
+    return torch.nan_to_num(moved).clamp(-most, most)
+
+
+def blend_motion(moved: Tensor, moment: Moment, camera: Camera, engine: Engine) -> Tensor:
+    """Return the expected (H, W, 2) displacement where splats have displacements (N, 2) [px]."""
+    scale = max(float(moved.detach().abs().max()) if len(moved) else 0.0, 1e-6)
     # engines clamp colours at 0, so displacements go to [0, 1] and back: with weights w that sum
     # to alpha, sum w (d / s + 1) / 2 = (sum w d / s + alpha) / 2
     colours = moved.new_full((len(moved), 3), 0.5)

@@ -1,6 +1,8 @@
-"""Names of what eval and render write into a run folder, if told no other."""
+"""Names of what stands in a run folder beside the run: results, if told no other, and flow."""
 
 from __future__ import annotations
+
+import re
 
 EVALUATION, FILMS = OUTPUTS = "eval", "render"
 """Folders in that of a run; each has the name of its command."""
@@ -10,3 +12,6 @@ METRICS = "metrics.json"
 
 REPORTS = "report.md", "report.html"
 """The pages that eval writes beside it."""
+
+FLOW, FLOW_FILE = "flow", re.compile(r"[0-9a-f]{32}\.npz")
+"""The folder in that of a run that keeps flow between pictures, and how its files are called."""

@@ -209,7 +209,7 @@ class Trainer:
             weights = self.tiles.choose(row, tiles, self.generator)
         if self.model.needs_jitter:
             jitter = float(torch.randn((), generator=self.generator))
-        others = self.renderer.other_times(view.time, self._times, self.generator)
+        others = self.renderer.other_times(view, self._times, self.generator)
         return Order(row, weights, jitter, others, self.renderer.seed(self.generator))
 
     def _penalty(self, order: Order, progress: float) -> Penalty | None:

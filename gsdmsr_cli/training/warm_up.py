@@ -85,7 +85,8 @@ def _small(scene: Scene) -> Scene:
     size = 32 + first.width % 16
     views = []
     for i, moment in enumerate(scene.train_times):
-        angle = 2 * math.pi * i / len(scene.train_times)
+        # two moments for each camera, for terms of the loss that compare these
+        angle = 2 * math.pi * (i // 2) / len(scene.train_times)
         centre = 3 * scene.bound * np.array([math.cos(angle), math.sin(angle), 0.5])
         pose = look_at(centre, np.zeros(3), np.array([0.0, 0.0, 1.0]))
         camera = Camera(pose, size, size, size / 2, size / 2, size, size)

@@ -16,6 +16,8 @@ OURS = {
     "eval/report.html": "",
     "eval/report.md": "",
     f"eval/.gsdmsr-{'0f' * 16}.part.json": "",
+    f"flow/{'0f' * 16}.npz": "",
+    f"flow/.gsdmsr-{'0f' * 16}.part.npz": "",
     "render/orbit.film.json": '{"gsdmsr": "0.2"}',
     "render/orbit.webm": "",
     "render/orbit/0000.png": "",
@@ -28,6 +30,8 @@ OTHERS = {
     "render/orbit/0001.txt": "",
     "render/mine.film.json": '{"by": "me"}',
     "render/mine/0000.png": "",
+    "flow/mine.npz": "",
+    f"flow/{'0f' * 16}.txt": "",
     "x.ply": "",
 }
 
@@ -54,7 +58,7 @@ def test_folders_that_are_empty_then_go_as_well(tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("name", ["eval", "render"])
+@pytest.mark.parametrize("name", ["eval", "flow", "render"])
 def test_what_a_link_leads_to_stays(tmp_path: Path, name: str) -> None:
     write(tmp_path / "elsewhere", OURS)
     (tmp_path / "run").mkdir()

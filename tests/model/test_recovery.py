@@ -37,6 +37,14 @@ def waving(means: Tensor, time: float) -> Tensor:
     return means + 0.15 * torch.stack(offsets, dim=1)
 
 
+def on_waves(means: Tensor, time: float) -> Tensor:
+    """Every splat goes on a Fourier series of its own, of two octaves."""
+    ways = 0.3 * torch.nn.functional.normalize(means.roll(1, dims=1), dim=1)
+    slow, fast = math.pi * time, 2 * math.pi * time
+    offset = math.sin(slow) * ways + 0.5 * math.cos(slow) * ways.roll(1, dims=1)
+    return means + offset + 0.3 * math.sin(fast) * ways.roll(2, dims=1) - 0.2 * ways
+
+
 def along_an_arc(means: Tensor, time: float) -> Tensor:
     """All splats go round one axis together, and up: a rigid motion."""
     turn, rise = 0.8 * (time - 0.5), 0.3 * (time - 0.5)
@@ -241,6 +249,12 @@ CASES = {
     ),
     "polynomial_fourier": Case(
         {"name": "polynomial_fourier", "rate": [1e-2, 1e-4]}, moved(drifting_and_swinging)
+    ),
+    "fourier": Case(
+        {"name": "fourier"},
+        moved(on_waves),
+        options=("optimizer.means=[5e-3,1e-4]",),
+        steps=1500,
     ),
     "deformation_network": Case(
         {

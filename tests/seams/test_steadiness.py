@@ -13,6 +13,7 @@ from torch import Tensor
 from training_checks import STEPS, preset_of, trainer_of
 
 from gsdmsr_cli.ground.errors import UsageError
+from gsdmsr_cli.scene.scene import View
 from gsdmsr_cli.training.losses import Seen, Term
 from gsdmsr_cli.training.trainer import Trainer, check_plugins
 
@@ -34,7 +35,7 @@ class Steadiness(Term):
         return self.factor
 
     def other_time(
-        self, time: float, times: Sequence[float], generator: torch.Generator
+        self, view: View, times: Sequence[float], generator: torch.Generator
     ) -> float | None:
         return times[int(torch.randint(len(times), (), generator=generator))]
 

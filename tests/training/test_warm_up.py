@@ -12,6 +12,8 @@ import torch
 from training_checks import OPTIONS, STEPS, preset_of, trainer_of
 
 from gsdmsr_cli.raster import best_engine
+from gsdmsr_cli.training.losses import Seen
+from gsdmsr_cli.training.losses.flow import Flow
 from gsdmsr_cli.training.warm_up import warm_up, warm_up_motion
 
 IN_A_NEW_PROCESS = """
@@ -24,6 +26,8 @@ from gsdmsr_cli.scene.pictures import Pictures
 from gsdmsr_cli.options.preset import load_preset
 from gsdmsr_cli.raster import best_engine
 from gsdmsr_cli.training.trainer import Trainer
+from gsdmsr_cli.training.losses import Seen
+from gsdmsr_cli.training.losses.flow import Flow
 from gsdmsr_cli.training.warm_up import warm_up, warm_up_motion
 
 def compiled():
@@ -71,3 +75,22 @@ def test_warming_up_leaves_the_random_state(tiny_scene: Path, warm: object) -> N
     assert callable(warm)
     warm(trainer.scene, trainer.preset, best_engine("cpu"))
     assert torch.equal(torch.random.get_rng_state(), before)
+
+
+def test_terms_that_compare_two_moments_of_a_camera_are_warmed_up(
+    tiny_scene: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also where it is not the scene's own cameras that say so."""
+    learns: list[bool] = []
+    compare = Flow.__call__
+
+    def told(term: Flow, seen: Seen) -> torch.Tensor:
+        value = compare(term, seen)
+        learns.append(value.requires_grad)
+        return value
+
+    monkeypatch.setattr(Flow, "__call__", told)
+    preset = preset_of("losses.terms=[{name: flow}]", "training.low_resolution_until=0")
+    trainer = trainer_of(tiny_scene, preset)
+    warm_up(trainer.scene, preset, best_engine("cpu"))
+    assert any(learns)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
+from pathlib import Path
 
 import torch
 from torch import Tensor
@@ -33,6 +34,7 @@ class TrainingRenderer:
     Attributes:
         background: (3,) colour behind the splats, on the device.
         terms: of the loss, beside the photometric one.
+        notes: what the terms have to say of the views.
     """
 
     def __init__(
@@ -46,8 +48,15 @@ class TrainingRenderer:
         self.preset, self.engine, self.pictures, self.views = preset, engine, pictures, views
         self.background = torch.tensor(BACKGROUNDS[preset.data.background]).to(device)
         self.terms = [start_term(settings) for settings in preset.losses.terms]
+        told = [term.begin(views, engine) for term in self.terms]
+        self.notes = [text for text in told if text is not None]
         self._halved = HalvedPictures(pictures)
         self._resident = ResidentPictures(torch.device(device), preset.data.cache_mib << 20)
+
+    def cache_in(self, folder: Path) -> None:
+        """Let terms keep in a run folder what is costly to compute; before workers are forked."""
+        for term in self.terms:
+            term.cache_in(folder)
 
     def gradients(self, model: Model, orders: Sequence[Order], phase: Phase) -> list[ViewGradients]:
         """Return what each of the ordered views says of the model.
@@ -124,10 +133,10 @@ class TrainingRenderer:
         )  # fmt: skip
 
     def other_times(
-        self, time: float, times: Sequence[float], generator: torch.Generator
+        self, view: View, times: Sequence[float], generator: torch.Generator
     ) -> tuple[float | None, ...]:
         """Return the second time that each term wants for a view, see ``Term.other_time``."""
-        return tuple(term.other_time(time, times, generator) for term in self.terms)
+        return tuple(term.other_time(view, times, generator) for term in self.terms)
 
     def seed(self, generator: torch.Generator) -> int:
         """Return the seed of the terms' random choices for a view, 0 if they make none."""

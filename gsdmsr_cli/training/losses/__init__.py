@@ -11,6 +11,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, ClassVar
 
 import torch
@@ -20,6 +21,7 @@ from gsdmsr_cli.gaussians.frame import Frame
 from gsdmsr_cli.gaussians.moment import Moment
 from gsdmsr_cli.ground import plugins
 from gsdmsr_cli.model.layer import Instant, options_of
+from gsdmsr_cli.raster import Engine
 from gsdmsr_cli.scene.camera import Camera
 from gsdmsr_cli.scene.pictures import HalvedPictures, Pictures
 from gsdmsr_cli.scene.scene import View
@@ -70,13 +72,28 @@ class Term(ABC):
         """Return the factor of the term at ``progress`` in [0, 1]; with 0 it costs nothing."""
         return 1.0
 
+    def begin(self, views: Sequence[View], engine: Engine) -> str | None:
+        """Learn of what there is to train on, once, before any process is forked.
+
+        Args:
+            views: the train views.
+            engine: what draws.
+
+        Returns:
+            what the user is to know of it, such as that the term has nothing to compare.
+        """
+        return None
+
+    def cache_in(self, folder: Path) -> None:  # noqa: B027  (most have nothing to keep)
+        """Keep in the run folder what is costly to compute again."""
+
     def other_time(
-        self, time: float, times: Sequence[float], generator: torch.Generator
+        self, view: View, times: Sequence[float], generator: torch.Generator
     ) -> float | None:
         """Return a second time in [0, 1] at which the term wants the model, or None.
 
         Args:
-            time: of the view.
+            view: that is to be seen.
             times: distinct train times, ascending.
             generator: source of random choices.
         """

@@ -12,6 +12,7 @@ from torch import Tensor
 from gsdmsr_cli.gaussians.splats import Splats
 from gsdmsr_cli.ops.finite import finite_rows
 from gsdmsr_cli.options.strict import require
+from gsdmsr_cli.scene.scene import View
 from gsdmsr_cli.training.losses import Seen, Term
 
 
@@ -43,10 +44,10 @@ class ComparingTerm(Term):
         return self.schedule.factor if progress < self.schedule.until else 0.0
 
     def other_time(
-        self, time: float, times: Sequence[float], generator: torch.Generator
+        self, view: View, times: Sequence[float], generator: torch.Generator
     ) -> float | None:
         """Return the train time before or after, whichever chance says, or the only one there."""
-        return adjacent_time(time, times, generator)
+        return adjacent_time(view.time, times, generator)
 
 
 def adjacent_time(time: float, times: Sequence[float], generator: torch.Generator) -> float | None:

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from gsdmsr_cli.gaussians.splats import Splats
 from gsdmsr_cli.ground.geometry import as_rigid_as_possible
+from gsdmsr_cli.scene.scene import View
 from gsdmsr_cli.training.losses._comparing import any_time
 from gsdmsr_cli.training.losses._neighbours import (
     Neighbourhoods,
@@ -33,10 +34,10 @@ class AsRigidAsPossible(NeighbourTerm):
     """|(x_j - x_i) - R_i (x_j' - x_i')|^2, the prime being any train time."""
 
     def other_time(
-        self, time: float, times: Sequence[float], generator: torch.Generator
+        self, view: View, times: Sequence[float], generator: torch.Generator
     ) -> float | None:
         """Return any other train time."""
-        return any_time(time, times, generator)
+        return any_time(view.time, times, generator)
 
     def deviations(self, now: Splats, other: Splats, found: Neighbourhoods) -> Tensor:
         """Return the squared lengths (S, K)."""

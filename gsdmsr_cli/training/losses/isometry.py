@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from gsdmsr_cli.gaussians.splats import Splats
+from gsdmsr_cli.scene.scene import View
 from gsdmsr_cli.training.losses._comparing import first_time
 from gsdmsr_cli.training.losses._neighbours import (
     Neighbourhoods,
@@ -31,10 +32,10 @@ class Isometry(NeighbourTerm):
     """| |x_j - x_i| - |x_j' - x_i'| |, the prime being the first train time."""
 
     def other_time(
-        self, time: float, times: Sequence[float], generator: torch.Generator
+        self, view: View, times: Sequence[float], generator: torch.Generator
     ) -> float | None:
         """Return the first train time, or None for views of it."""
-        return first_time(time, times)
+        return first_time(view.time, times)
 
     def deviations(self, now: Splats, other: Splats, found: Neighbourhoods) -> Tensor:
         """Return the differences (S, K)."""

@@ -1,0 +1,166 @@
+"""How pictures say that things have moved: optical flow between neighbouring views, kept in files.
+
+Views are neighbours where one camera, or one that has hardly moved, took them one moment after the
+other. Cameras that jump between moments, as in D-NeRF's scenes, have none.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import zlib
+from collections.abc import Iterator, Sequence
+from hashlib import blake2b
+from pathlib import Path
+from zipfile import BadZipFile
+
+import numpy as np
+from torch import Tensor
+
+from gsdmsr_cli.ground.errors import DataError
+from gsdmsr_cli.ground.files import replacing
+from gsdmsr_cli.scene.camera import Camera
+from gsdmsr_cli.scene.native import cv2
+from gsdmsr_cli.scene.optical_flow import Floats32, Grey, optical_flow, trusted
+from gsdmsr_cli.scene.pictures import HalvedPictures, Pictures
+from gsdmsr_cli.scene.scene import View
+
+MOST_TURN = math.radians(5)
+"""Neighbouring views look in directions that differ by this at most [rad]."""
+
+MOST_WAY = 0.1
+"""And are taken from places this far apart at most, in units of how far any are from their mean."""
+
+INCONSISTENT = 1.0
+"""Flow there and back that ends so far from its start is not to be trusted [px]."""
+
+STEPS = 16
+"""Flow is kept in this many steps a pixel: what stands still then takes hardly any room."""
+
+SMALLEST = 32
+"""Shortest side of pictures that have a flow [px]."""
+
+
+def neighbours(views: Sequence[View]) -> dict[View, tuple[View, ...]]:
+    """Return the views one moment before and after each, from the same place; perhaps neither."""
+    moments: dict[float, list[View]] = {}
+    for view in views:
+        moments.setdefault(view.time, []).append(view)
+    times = sorted(moments)
+    centres = np.stack([view.camera.centre for view in views])
+    most = MOST_WAY * float(np.linalg.norm(centres - centres.mean(0), axis=1).max())
+    found = {}
+    for i, time in enumerate(times):
+        beside = [moments[other] for other in (*times[max(i - 1, 0) : i], *times[i + 1 : i + 2])]
+        for view in moments[time]:
+            nearest = (_nearest(view, others, most) for others in beside)
+            found[view] = tuple(other for other in nearest if other is not None)
+    return found
+
+
+def _nearest(view: View, others: Sequence[View], most: float) -> View | None:
+    """Return the view taken from nearest by, or None if that is too far away."""
+    near = [other for other in others if _alike(view.camera, other.camera, most)]
+    return min(near, key=lambda other: _way(view.camera, other.camera), default=None)
+
+
+def _alike(one: Camera, other: Camera, most: float) -> bool:
+    """Return whether a camera is the other one, or has hardly moved since."""
+    turn = one.rotation @ other.rotation.T
+    cosine = (np.trace(turn) - 1) / 2
+    lens = [(c.fx, c.fy, c.cx, c.cy, c.width, c.height) for c in (one, other)]
+    near = _way(one, other) <= most and cosine >= math.cos(MOST_TURN)
+    return bool(near) and lens[0] == lens[1]
+
+
+def _way(one: Camera, other: Camera) -> float:
+    return float(np.linalg.norm(one.centre - other.centre))
+
+
+class PicturedFlow:
+    """Flow between pictures, computed when it is first asked for.
+
+    Attributes:
+        folder: where it is kept for later, as files named by what is in the pictures; None keeps
+            nothing.
+    """
+
+    def __init__(self) -> None:
+        self.folder: Path | None = None
+        self._names: dict[tuple[View, View, int], str] = {}
+
+    def between(self, pictures: Pictures | HalvedPictures, view: View, other: View) -> Floats32:
+        """Return (H, W, 2) from a view's picture to another's [px], NaN where it is not trusted.
+
+        Raises:
+            DataError: a picture cannot be read.
+        """
+        camera = pictures.camera(view)
+        if min(camera.width, camera.height) < SMALLEST:
+            return np.full((camera.height, camera.width, 2), np.nan, np.float32)
+        key = view, other, camera.width
+        if self.folder is not None and key in self._names:
+            found = _read(self.folder / self._names[key], (camera.height, camera.width, 2))
+            if found is not None:
+                return found
+        here, there = pictures.load(view), pictures.load(other)
+        self._names[key] = f"{_digest(here, there)}.npz"
+        path = None if self.folder is None else self.folder / self._names[key]
+        found = None if path is None else _read(path, (camera.height, camera.width, 2))
+        if found is None:
+            found = _consistent_flow(_grey(here), _grey(there))
+            if path is not None:
+                _write(path, found)
+        return found
+
+
+def _digest(here: Tensor, there: Tensor) -> str:
+    """Return a name for two pictures, by their pixels."""
+    hashed = blake2b(repr((tuple(here.shape), INCONSISTENT)).encode(), digest_size=16)
+    for picture in (here, there):
+        hashed.update(picture.numpy().tobytes())
+    return hashed.hexdigest()
+
+
+def _grey(picture: Tensor) -> Grey:
+    pixels = np.ascontiguousarray(picture.permute(1, 2, 0).numpy())
+    return np.asarray(cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY), np.uint8)
+
+
+def _consistent_flow(here: Grey, there: Grey) -> Floats32:
+    """Return the flow as precisely as it is kept, so that first and later uses agree."""
+    with _one_thread():
+        forward, back = optical_flow(here, there), optical_flow(there, here)
+        sure = trusted(forward, back, INCONSISTENT)
+    rounded = (forward * STEPS).round() / STEPS
+    return np.where(sure[..., None], rounded, np.nan).astype(np.float16).astype(np.float32)
+
+
+@contextlib.contextmanager
+def _one_thread() -> Iterator[None]:
+    """Let OpenCV use one thread: with more the flow is another, and forked processes hang."""
+    before = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    try:
+        yield
+    finally:
+        cv2.setNumThreads(before)
+
+
+def _read(path: Path, shape: tuple[int, ...]) -> Floats32 | None:
+    """Return the flow in a file, or None if it is not there, damaged or of another shape."""
+    try:
+        with np.load(path, allow_pickle=False) as arrays:
+            found = arrays["flow"]
+    except (OSError, ValueError, EOFError, KeyError, BadZipFile, zlib.error):
+        return None
+    fits = found.shape == shape and found.dtype == np.float16
+    return np.asarray(found, np.float32) if fits else None
+
+
+def _write(path: Path, flow: Floats32) -> None:
+    """Keep a flow; a disk that does not take it costs time later, and nothing else."""
+    with contextlib.suppress(OSError, DataError):
+        path.parent.mkdir(exist_ok=True)
+        with replacing(path, durable=False) as beside:
+            np.savez_compressed(beside, flow=flow.astype(np.float16))
