@@ -212,7 +212,7 @@ def test_the_example_of_an_engine_conforms(
 def test_the_example_of_an_export_writes_and_refuses(splat: ModuleType, tmp_path: Path) -> None:
     model = Model(splats_of(5), {"motion": started("static", 5)})
     facts, out = Facts(1.3, CUBE, 10), tmp_path / "made" / "a.splat"
-    assert exports.format_names() == ["ply", "ply-sequence", "splat"]
+    assert exports.format_names() == ["compact", "ply", "ply-sequence", "splat"]
     out.parent.mkdir()
     assert exports.export("splat", model, facts, Located({"time": 0.5}), out) == [out]
     kinds = [("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("quats", "u1", 4)]

@@ -55,7 +55,7 @@ def _trained(run: Run) -> dict[str, Any]:
         "moving": model.moving,
         **psnr,
         "checkpoint_bytes": run.checkpoint_path.stat().st_size,
-        **protocol.storage(checkpoint.tensors),
+        **protocol.storage(checkpoint.sizes()),
         "evaluated": (run.root / EVALUATION / METRICS).is_file(),
     }
 

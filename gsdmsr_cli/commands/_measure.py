@@ -63,7 +63,7 @@ def measure(trained: Trained, request: Request) -> dict[str, Any]:
         "speed": speed.document(),
         "storage": {
             "checkpoint_bytes": trained.checkpoint.file_bytes,
-            **protocol.storage(trained.checkpoint.tensors),
+            **protocol.storage(trained.checkpoint.sizes()),
         },
         "training": _training(trained),
     }

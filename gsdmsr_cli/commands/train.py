@@ -25,7 +25,8 @@ from gsdmsr_cli.ground.errors import DataError, UsageError
 from gsdmsr_cli.ground.files import write_json
 from gsdmsr_cli.ground.locks import one_of_readers, sole_writer
 from gsdmsr_cli.options.preset import BACKGROUNDS, Preset
-from gsdmsr_cli.runs.run import SCHEMA, Run, require_apart
+from gsdmsr_cli.runs.checkpoints import SCHEMA
+from gsdmsr_cli.runs.run import Run, require_apart
 from gsdmsr_cli.scene.pictures import Pictures
 from gsdmsr_cli.scene.scene import Scene
 from gsdmsr_cli.training import memory

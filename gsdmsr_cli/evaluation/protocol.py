@@ -164,11 +164,15 @@ def _explained(value: float | None, metric: Metric | Missing) -> dict[str, Any]:
     return {"value": value, "reason": reason, "searched": []}
 
 
-def storage(tensors: Mapping[str, Tensor]) -> dict[str, int]:
-    """Return the bytes of a checkpoint's tensors: splats, motion, and what training adds."""
+def storage(stored: Mapping[str, int]) -> dict[str, int]:
+    """Return the bytes of a checkpoint by parts: splats, motion, and what training adds.
+
+    Args:
+        stored: bytes of each tensor by its name, as ``Checkpoint.sizes`` has them.
+    """
     sizes = {"splats_bytes": 0, "motion_bytes": 0, "training_state_bytes": 0}
-    for name, tensor in tensors.items():
+    for name, count in stored.items():
         splats, moved = name.startswith(STORED_AS), name.startswith((f"{MOTION}.", FURTHER))
         kind = "splats" if splats else "motion" if moved else "training_state"
-        sizes[f"{kind}_bytes"] += tensor.nbytes
+        sizes[f"{kind}_bytes"] += count
     return sizes

@@ -32,6 +32,21 @@ class Facts(Protocol):
         """Number of distinct times of the train views."""
 
 
+class RunFacts(Facts, Protocol):
+    """What the command gives beside it, for a format that is a run folder itself."""
+
+    @property
+    def step(self) -> int:
+        """Steps that the training has made."""
+
+    @property
+    def progress(self) -> float:
+        """How far the training has come, in [0, 1]."""
+
+    def describe(self, folder: Path) -> None:
+        """Write to a new folder what the run's own says of its options, its scene and pictures."""
+
+
 class Exporter(Protocol):
     """What a module of this package offers beside its ``Options``."""
 

@@ -7,7 +7,7 @@ import json
 import os
 import re
 import shutil
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,9 +23,14 @@ from gsdmsr_cli.ground.files import (
     replacing,
     written_apart,
 )
+from gsdmsr_cli.runs.packing import unpack
 
 LAST = "checkpoint.safetensors"
 """Name of the last checkpoint."""
+
+SCHEMA = 2
+"""Of ``run.json`` and checkpoints. In 1, before version 0.2, the motion ``control_points`` and its
+tensor were called ``nodes``, and checkpoints counted events otherwise; 1 is converted when read."""
 
 WRONG = LookupError, TypeError, ValueError, AttributeError, OverflowError, RecursionError
 """What values of other kinds than were written end in."""
@@ -46,6 +51,8 @@ class Checkpoint:
         state: everything else that a resumed training needs, plain JSON.
         sha256: of the file that it was read from; empty where it was not.
         file_bytes: size of that file.
+        packed: bytes of each tensor in that file, where it is packed, see ``runs.packing``; such a
+            checkpoint can be drawn, and not be trained further.
     """
 
     step: int
@@ -55,6 +62,12 @@ class Checkpoint:
     state: dict[str, Any]
     sha256: str = ""
     file_bytes: int = 0
+    packed: Mapping[str, int] | None = None
+
+    def sizes(self) -> dict[str, int]:
+        """Return the bytes of each tensor, as they are stored."""
+        own = {name: tensor.nbytes for name, tensor in self.tensors.items()}
+        return own if self.packed is None else dict(self.packed)
 
 
 def save(root: Path, checkpoint: Checkpoint, schema: int, count: int) -> None:
@@ -155,8 +168,28 @@ def read(path: Path) -> tuple[Checkpoint, int]:
     about = json.loads(_metadata(data)["gsdmsr"])
     step, progress, elapsed = int(about["step"]), float(about["progress"]), float(about["elapsed"])
     whose = hashlib.sha256(data).hexdigest(), len(data)
-    checkpoint = Checkpoint(step, progress, elapsed, load(data), dict(about["state"]), *whose)
+    tensors, packed = load(data), None
+    if "packed" in about:
+        packed = {name: tensor.nbytes for name, tensor in tensors.items()}
+        tensors = unpack(tensors, about["packed"])
+    state = dict(about["state"])
+    checkpoint = Checkpoint(step, progress, elapsed, tensors, state, *whose, packed)
     return checkpoint, int(about["schema"])
+
+
+def save_packed(
+    root: Path, tensors: Mapping[str, Tensor], described: Mapping[str, Any], step: int, p: float
+) -> Path:
+    """Write a packed model as the only checkpoint of a run folder, see ``runs.packing``.
+
+    Raises:
+        DataError: it cannot be written.
+    """
+    about = {"schema": SCHEMA, "step": step, "progress": p, "elapsed": 0.0, "state": {}}
+    about["packed"] = described
+    with replacing(root / LAST) as beside, written_apart(beside) as own:
+        save_file(dict(tensors), own, metadata={"gsdmsr": json.dumps(about)})
+    return root / LAST
 
 
 def _metadata(data: bytes) -> dict[str, str]:

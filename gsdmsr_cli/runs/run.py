@@ -39,13 +39,9 @@ from gsdmsr_cli.options import strict
 from gsdmsr_cli.options.preset import Preset
 from gsdmsr_cli.options.renamed import with_present_names
 from gsdmsr_cli.runs import checkpoints, earlier, log, seen_pictures
-from gsdmsr_cli.runs.checkpoints import LAST, WRONG, Checkpoint
+from gsdmsr_cli.runs.checkpoints import LAST, SCHEMA, WRONG, Checkpoint
 from gsdmsr_cli.scene.picture_hashes import digest
 from gsdmsr_cli.scene.scene import Scene
-
-SCHEMA = 2
-"""Of ``run.json`` and checkpoints. In 1, before version 0.2, the motion ``control_points`` and its
-tensor were called ``nodes``, and checkpoints counted events otherwise; 1 is converted when read."""
 
 _READ = 1, SCHEMA
 _ABOUT, _LOG, _TRAINING = "run.json", "metrics.jsonl", "training.json"
@@ -122,6 +118,17 @@ class Run:
         }
         write_json(self.root / _ABOUT, about)
 
+    def describe_at(self, root: Path) -> None:
+        """Describe a run of the same options and scene in another folder, which is made.
+
+        Raises:
+            DataError: it cannot be written.
+        """
+        pictures = self.root / seen_pictures.PICTURES
+        replace(self, root=root).describe()
+        if pictures.is_file():
+            write_json(root / seen_pictures.PICTURES, read_json(pictures))
+
     def check_scene(self, scene: Scene) -> None:
         """Raise DataError unless the scene is the one that the run was trained on."""
         if scene.fingerprint != self.fingerprint:
@@ -171,9 +178,16 @@ class Run:
             DataError: there is none.
         """
         try:
-            return self.load(), None
+            checkpoint = self.load()
         except DataError as error:
             reason = error
+        else:
+            if checkpoint.packed is not None:
+                raise DataError(
+                    f"{self.root}: holds a packed model, which cannot be trained further; resume "
+                    "the run that it was exported from"
+                )
+            return checkpoint, None
         for path in checkpoints.kept(self.root):
             with suppress(DataError):
                 checkpoint = self._load(path)

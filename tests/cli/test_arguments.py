@@ -190,7 +190,7 @@ def test_commands_get_typed_arguments(
 
 
 def test_every_exporter_is_offered(gsdmsr: Gsdmsr) -> None:
-    assert {"ply", "ply-sequence"} <= set(format_names())
+    assert {"compact", "ply", "ply-sequence"} <= set(format_names())
     for name in format_names():
         assert gsdmsr(f"export r --format {name} --out o") == 0
         assert gsdmsr.calls[-1] == ("export", (Path("r"), name, None, None, [], Path("o")))
