@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from kernel_checks import generator
@@ -19,6 +21,8 @@ from gsdmsr_cli.ground.errors import UsageError
 from gsdmsr_cli.ground.geometry import covariance, scaled_axes
 from gsdmsr_cli.model.layer import Instant, Layer
 from gsdmsr_cli.model.motion.covariance_4d import Covariance4D
+from gsdmsr_cli.raster import load_engine
+from gsdmsr_cli.scene.camera import Camera, look_at
 
 NAME, COUNT, SHRINK = "covariance_4d", 5, 1.6
 
@@ -128,6 +132,19 @@ def test_splats_that_stand_still_are_drawn_by_their_own_rotations_and_scales() -
     assert order == [0, 2, 3, 4, 1] and found.axes is not None
     assert torch.equal(found.axes[:4], before.axes[order[:4]])
     assert torch.equal(found.axes[4], scaled_axes(splats.quats, splats.log_scales)[1])
+
+
+@torch.no_grad()
+def test_the_engine_of_the_cpu_draws_slices_as_the_reference_does() -> None:
+    pose = look_at(np.array([4.0, 1.0, 1.5]), np.zeros(3), np.array([0.0, 0.0, 1.0]))
+    camera, white = Camera(pose, 40.0, 40.0, 16.0, 12.0, 32, 24), torch.ones(3)
+    splats = replace(splats_of(40), log_scales=splats_of(40).log_scales + 1)
+    moment = disturbed(started(NAME, 40, duration=0.5)).at(Moment(splats), Instant(0.4))
+    found, expected = (
+        load_engine(name).rasterize(moment, camera, white).rgb for name in ("cpu", "reference")
+    )
+    assert float((expected - 1).abs().max()) > 0.2
+    torch.testing.assert_close(found, expected, atol=2e-3, rtol=0)
 
 
 def test_splats_that_are_long_in_time_are_to_be_split() -> None:
