@@ -6,6 +6,7 @@ GroupFlow of SpeeDe3DGS (Tu et al., CVPR 2026, section 3.3).
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -83,8 +84,8 @@ def fit_movements(
     """Return how each group moves as a rigid body, (J, 10): see ``ops.skin.transforms``.
 
     By least squares over its splats. These count as bodies rather than points, by the ends of
-    their axes, so that a group of one turns as it does. The last three columns are the mean growth
-    of the logarithms of scales. A group without splats stays where it is.
+    their axes, so that a group of one turns as it does. Nothing grows. A group without
+    splats stays where it is.
 
     Args:
         before, after: N splats.
@@ -107,8 +108,34 @@ def fit_movements(
     outer = arms[1][:, :, None] * arms[0][:, None] + turned @ axes.mT
     quats = nearest_quats(mean(outer.flatten(1)).unflatten(1, (3, 3)))
     ways = (quat_to_rotmat(quats) @ (anchors - middle)[:, :, None])[:, :, 0] + aim - anchors
-    growth = mean((after.log_scales - before.log_scales).mean(dim=1, keepdim=True))
-    return torch.cat([ways, quats - _identity(quats), growth.expand(-1, 3)], dim=1)
+    return torch.cat([ways, quats - _identity(quats), torch.zeros_like(ways)], dim=1)
+
+
+def settle(
+    before: Splats, then: Sequence[Splats], group: Tensor, weights: Tensor, anchors: Tensor
+) -> Splats:
+    """Return splats, instead of ``before``, whose groups' movements fit a few times best.
+
+    Each goes to the mean of where these movements take it from (generalised Procrustes analysis,
+    Gower 1975): so what is not rigid is a little wrong at all times, rather than right at the time
+    of ``before`` and the more wrong the further away from it. Sizes are the means of those times.
+
+    Args:
+        before: N splats.
+        then: they at the times.
+        group, weights, anchors: see ``fit_movements``.
+    """
+    for _ in range(ROUNDS):
+        total = torch.zeros_like(before.means)
+        for after in then:
+            movements = fit_movements(before, after, group, weights, anchors)
+            ways, turns, _ = movements.split(PARTS, 1)
+            matrices = quat_to_rotmat(turns + _identity(turns))[group]
+            arms = after.means - (anchors + ways)[group]
+            total += (matrices.mT @ arms[:, :, None])[:, :, 0] + anchors[group]
+        before = replace(before, means=total / len(then))
+    scales = torch.stack([after.log_scales.exp() for after in then]).mean(dim=0)
+    return replace(before, log_scales=scales.log())
 
 
 def align(keys: Tensor, start: int) -> Tensor:

@@ -102,7 +102,7 @@ class RigidGroups(TakingOver):
     def distil(self, splats: Splats) -> tuple[Splats, Sequence[str]]:
         """Group the splats by how the base moves them; each group moves as they do in the mean.
 
-        The canonical splats become those of half time.
+        The canonical splats become those of half time, moved to where they fit all times best.
         """
         base, last = self.base, len(self.keys) - 1
         if base is None or self.active:
@@ -119,10 +119,11 @@ class RigidGroups(TakingOver):
         shown = before.logit_opacities.sigmoid(), self.anchors
         group = grouping.group_splats(before, then, near, *shown)
         self.group.copy_(group[:, None])
+        before = grouping.settle(before, then, group, *shown)
         keys = [
             grouping.fit_movements(before, at(i / last), group, *shown) for i in range(last + 1)
         ]
-        self.keys.copy_(grouping.align(torch.stack(keys), len(keys) // 2))
+        self.keys.copy_(grouping.align(torch.stack(keys), last // 2))
         return before, self.take_over(len(splats))
 
     @torch.no_grad()

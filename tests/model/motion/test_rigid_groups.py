@@ -25,6 +25,7 @@ from gsdmsr_cli.model.motion._grouping import (
     fit_movements,
     group_paths,
     group_splats,
+    settle,
 )
 from gsdmsr_cli.model.motion.rigid_groups import RigidGroups
 from gsdmsr_cli.ops.skin import skin_twin, transforms_twin
@@ -86,7 +87,6 @@ def test_the_movement_of_a_group_is_found_from_its_splats() -> None:
         before,
         means=torch.from_numpy(rotation.apply(before.means.numpy())) + 0.3,
         quats=-2 * torch.from_numpy(turned.as_quat(scalar_first=True)),
-        log_scales=before.log_scales + 0.2,
     )
     group, anchors = torch.tensor([0] * 19 + [2]), torch.randn(3, 3).double()
     weights = torch.rand(20, generator=generator()).double() + 0.1
@@ -123,6 +123,25 @@ def test_a_splat_joins_the_group_whose_movement_fits_it() -> None:
     near[:20] = near[:20].flip(1)  # a quarter begins wrong
     found = group_splats(before, then, near, torch.ones(80), anchors)
     assert torch.equal(found, body)
+
+
+def test_what_is_not_rigid_is_wrong_a_little_at_all_times() -> None:
+    """Of a body that grows to twice its size while it turns: of one in between."""
+    sizes, whole = torch.linspace(1, 2, 8).double(), splats_of(30).map(Tensor.double)
+    turns = Rotation.from_rotvec([[0.0, 0.3 * i, 0.0] for i in range(8)]).as_matrix()
+    then = [
+        replace(
+            whole,
+            means=size * whole.means @ torch.from_numpy(turn).T,
+            log_scales=whole.log_scales + size.log(),
+        )
+        for size, turn in zip(sizes, turns, strict=True)
+    ]
+    group, anchors = torch.zeros(30, dtype=torch.int64), torch.zeros(1, 3).double()
+    found = settle(then[0], then, group, torch.ones(30).double(), anchors)
+    expected = torch.pdist(whole.means) * sizes.mean()
+    torch.testing.assert_close(torch.pdist(found.means), expected, rtol=1e-2, atol=0)
+    torch.testing.assert_close(found.log_scales, whole.log_scales + sizes.mean().log())
 
 
 def test_a_full_turn_goes_on_smoothly_between_keyframes() -> None:
