@@ -86,8 +86,8 @@ def swing(tmp_path: Path) -> Iterator[ModuleType]:
 
 
 @pytest.fixture
-def splat(tmp_path: Path) -> Iterator[ModuleType]:
-    yield from installed(exports, "splat", "adding-an-export.md", tmp_path)
+def xyz(tmp_path: Path) -> Iterator[ModuleType]:
+    yield from installed(exports, "xyz", "adding-an-export.md", tmp_path)
 
 
 @pytest.fixture
@@ -209,31 +209,30 @@ def test_the_example_of_an_engine_conforms(
         conformance.test_rows_that_are_not_finite_are_as_if_absent(placed, rows)
 
 
-def test_the_example_of_an_export_writes_and_refuses(splat: ModuleType, tmp_path: Path) -> None:
+def test_the_example_of_an_export_writes_and_refuses(xyz: ModuleType, tmp_path: Path) -> None:
     model = Model(splats_of(5), {"motion": started("static", 5)})
-    facts, out = Facts(1.3, CUBE, 10), tmp_path / "made" / "a.splat"
-    assert exports.format_names() == ["compact", "ply", "ply-sequence", "splat"]
-    out.parent.mkdir()
-    assert exports.export("splat", model, facts, Located({"time": 0.5}), out) == [out]
-    kinds = [("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("quats", "u1", 4)]
-    rows, splats = np.frombuffer(out.read_bytes(), kinds), model.splats.detach()
-    np.testing.assert_array_equal(rows["means"], splats.means)
-    np.testing.assert_allclose(rows["scales"], np.exp(splats.log_scales.numpy()), rtol=1e-6)
-    opacities = 1 / (1 + np.exp(-splats.logit_opacities.numpy()))
-    np.testing.assert_allclose(rows["rgba"][:, 3] / 255, opacities, atol=0.5 / 255 + 1e-6)
+    facts, out = Facts(1.3, CUBE, 10), tmp_path / "made" / "a.xyz"
+    assert "xyz" in exports.format_names()
+    harmonics = model.splats.sh.detach().repeat(1, 4, 1)
+    shaded = Model(replace(model.splats, sh=harmonics), {"motion": started("static", 5)})
+    refused = "cannot carry sizes and opacities nor colours that depend on the view of this run"
+    with pytest.raises(UsageError, match=f"--format xyz {refused}"):
+        exports.export("xyz", shaded, facts, Located({"time": 0.5}), out)
+    assert not out.parent.exists()
+    settings = {"time": 0.5, "digits": 3, "lossy": True, "axes": "y-up", "scale": 2.0}
+    written = exports.export("xyz", model, facts, Located(settings), out)
+    assert (written.files, written.splats) == ([out], 5)
+    rows, splats = np.loadtxt(out), model.splats.detach()
+    x, y, z = 2 * splats.means.numpy().T
+    np.testing.assert_allclose(rows[:, :3], np.stack([x, z, -y], axis=1), atol=0.5e-3 + 1e-6)
     colours = np.clip(0.5 + 0.28209479177387814 * splats.sh[:, 0].numpy(), 0, 1)
-    np.testing.assert_allclose(rows["rgba"][:, :3] / 255, colours, atol=0.5 / 255 + 1e-6)
-    units = splats.quats / splats.quats.norm(dim=1, keepdim=True)
-    np.testing.assert_allclose((rows["quats"] - 128.0) / 128, units, atol=1 / 128 + 1e-6)
-    harmonics = torch.cat([splats.sh, splats.sh, splats.sh, splats.sh], dim=1)
-    shaded = Model(replace(splats, sh=harmonics), {"motion": started("static", 5)})
-    with pytest.raises(UsageError, match="--format splat cannot carry colours that depend"):
-        exports.export("splat", shaded, facts, Located(), tmp_path / "b.splat")
-    assert not (tmp_path / "b.splat").exists()
-    (path,) = exports.export("splat", shaded, facts, Located({"mean_colour": True}), out)
-    assert path.read_bytes() == rows.tobytes()
-    with pytest.raises(UsageError, match="frames is not for --format splat, which takes time"):
-        exports.export("splat", model, facts, Located({"frames": 2}), out)
+    assert set(np.abs(rows[:, 3:] - 255 * colours).round().flat) <= {0, 1}
+    with pytest.raises(UsageError, match="digits is 10; allowed: 0 to 9"):
+        exports.export("xyz", model, facts, Located({"digits": 10}), out)
+    with pytest.raises(
+        UsageError, match="frames is not for --format xyz, which takes time, digits"
+    ):
+        exports.export("xyz", model, facts, Located({"frames": 2}), out)
 
 
 def test_the_example_of_a_path_swings(swing: ModuleType, tiny_scene: Path) -> None:
@@ -378,7 +377,7 @@ def test_paths_of_the_package_that_pages_name_exist(page: Path) -> None:
         f"gsdmsr_cli/{name}.py"
         for name in (
             "model/motion/linear", "model/layers/brightness", "formats/turntable", "paths/swing",
-            "exports/splat", "training/losses/sparsity", "training/population/duplicate",
+            "exports/xyz", "training/losses/sparsity", "training/population/duplicate",
             "raster/plain", "ops/temporal_opacity/__init__", "ops/temporal_opacity/twin",
             "ops/temporal_opacity/cpu",
         )

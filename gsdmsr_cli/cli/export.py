@@ -9,6 +9,7 @@ import typer
 
 from gsdmsr_cli.cli.options import RunFolder
 from gsdmsr_cli.exports import format_names
+from gsdmsr_cli.exports._asked import Axes
 
 if TYPE_CHECKING:
     FormatName = str
@@ -26,11 +27,27 @@ def export(
     format_: Annotated[FormatName, typer.Option("--format", help="Kind of file.")],
     out: Annotated[Path, typer.Option(metavar="PATH", help="File or folder to write.")],
     time: Annotated[
-        float | None, typer.Option(min=0.0, max=1.0, help="Moment of a ply, 0 to 1.")
+        float | None, typer.Option(min=0.0, max=1.0, help="Moment that is written, 0 to 1.")
     ] = None,
     frames: Annotated[
         int | None, typer.Option(min=1, help="Number of files of a sequence.")
     ] = None,
+    axes: Annotated[
+        Axes | None,
+        typer.Option(help="Axes of the file, of a scene with z up; the format's or the scene's."),
+    ] = None,
+    scale: Annotated[
+        float | None, typer.Option(help="Units of the file in one of the scene.")
+    ] = None,
+    sh_degree: Annotated[
+        int | None, typer.Option(min=0, max=3, help="Harmonics of higher degrees are left out.")
+    ] = None,
+    min_opacity: Annotated[
+        float | None, typer.Option(min=0.0, max=1.0, help="Fainter splats are left out.")
+    ] = None,
+    lossy: Annotated[
+        bool, typer.Option("--lossy", help="Leave out what the format cannot carry.")
+    ] = False,
     set_: Annotated[
         list[str] | None,
         typer.Option("--set", metavar="a=v", help="One option of the format; repeatable."),
@@ -39,4 +56,14 @@ def export(
     """Write a run's splats for other programs."""
     from gsdmsr_cli.commands import export as command
 
-    command.run(run_folder, format_, time, frames, set_ or [], out)
+    given = {
+        "time": time,
+        "frames": frames,
+        "axes": axes,
+        "scale": scale,
+        "sh_degree": sh_degree,
+        "min_opacity": min_opacity,
+        "lossy": lossy or None,
+    }
+    named = {key: value for key, value in given.items() if value is not None}
+    command.run(run_folder, format_, named, set_ or [], out)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,8 +20,7 @@ from gsdmsr_cli.runs.run import Run, open_with_model
 def run(
     run_folder: Path,
     format_: str,
-    time: float | None,
-    frames: int | None,
+    named: Mapping[str, object],
     overrides: Sequence[str],
     out: Path,
 ) -> None:
@@ -30,8 +29,7 @@ def run(
     Args:
         run_folder: the run.
         format_: one of ``exports.format_names()``.
-        time: the format's option of this name, or None for its default.
-        frames: likewise.
+        named: options that were given by names of their own.
         overrides: "name=value", further options of the format.
         out: file or folder to write.
 
@@ -40,14 +38,15 @@ def run(
             whole model.
         DataError: the run cannot be used, or ``out`` not be written.
     """
-    settings = _settings(time, frames, overrides)
+    settings = _settings(named, overrides)
     folder, model, checkpoint = open_with_model(run_folder)
     facts = _Source(folder, checkpoint)
     with progress_bar("writing splats") as on_progress, torch.no_grad():
         written = exports.export(format_, model, facts, settings, out, on_progress)
-    count, splats = len(written), len(model.splats)
+    count, splats = len(written.files), written.splats
     what = f"{out}" if count == 1 else f"{out}, {count} files"
-    document = {"format": format_, "files": [str(path) for path in written], "splats": splats}
+    files = [str(path) for path in written.files]
+    document = {"format": format_, "files": files, "splats": splats, "lost": written.lost}
     say.result(document, f"wrote {what}: {splats} splats")
 
 
@@ -83,8 +82,8 @@ class _Source:
         self.run.describe_at(folder)
 
 
-def _settings(time: float | None, frames: int | None, overrides: Sequence[str]) -> Located:
-    """Return all options of the format that are given, each with the place where it was."""
-    named = {key: value for key, value in (("time", time), ("frames", frames)) if value is not None}
+def _settings(named: Mapping[str, object], overrides: Sequence[str]) -> Located:
+    """Return all options that are given, each with the place where it was."""
     further = read_overrides(overrides)
-    return Located(named | further, {key: f"--{key}" for key in named} | further.places)
+    places = {key: f"--{key.replace('_', '-')}" for key in named}
+    return Located({**named, **further}, places | further.places)

@@ -8,15 +8,18 @@ a leading underscore.
 from __future__ import annotations
 
 import dataclasses
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, cast
 
-from gsdmsr_cli.ground import plugins
+from gsdmsr_cli.exports._asked import Asked, taken_apart
+from gsdmsr_cli.ground import plugins, say
 from gsdmsr_cli.ground.errors import UsageError
 from gsdmsr_cli.ground.progress import OnProgress
 from gsdmsr_cli.options import strict
 
 if TYPE_CHECKING:  # Model brings torch, which --help must not wait for
+    from gsdmsr_cli.exports._source import Source
     from gsdmsr_cli.model.model import Model
 
 
@@ -48,18 +51,23 @@ class RunFacts(Facts, Protocol):
 
 
 class Exporter(Protocol):
-    """What a module of this package offers beside its ``Options``."""
+    """What a module of this package offers beside its ``Options``.
+
+    A module whose format prescribes axes names them in ``AXES``, see ``Asked.axes``. One that
+    writes the model itself in place of its splats says ``WHOLE = True``, and takes none of
+    ``Asked``.
+    """
 
     Options: type[Any]
 
-    def lost(self, model: Model, options: Any) -> list[str]:
+    def lost(self, source: Source, options: Any) -> list[str]:
         """Return what the file cannot carry of the model with these options, a phrase for each.
 
         What the user leaves out by an option is not lost.
         """
 
     def write(
-        self, model: Model, facts: Facts, options: Any, out: Path, on_progress: OnProgress
+        self, source: Source, facts: Facts, options: Any, out: Path, on_progress: OnProgress
     ) -> list[Path]:
         """Write the model to the file or folder ``out`` and return the files written.
 
@@ -74,6 +82,21 @@ def format_names() -> list[str]:
     return [name.replace("_", "-") for name in plugins.names(__name__)]
 
 
+@dataclass(frozen=True)
+class Written:
+    """What has been exported.
+
+    Attributes:
+        files: that were written.
+        splats: in a file; in the one that has most.
+        lost: what they lack of the model, a phrase for each.
+    """
+
+    files: list[Path]
+    splats: int
+    lost: list[str]
+
+
 def export(
     format_: str,
     model: Model,
@@ -81,30 +104,48 @@ def export(
     settings: strict.Located,
     out: Path,
     on_progress: OnProgress = lambda done, total: None,
-) -> list[Path]:
-    """Write the model in a format and return the files written.
+) -> Written:
+    """Write the model in a format.
 
     Args:
         format_: one of ``format_names()``.
         model: what is written.
         facts: of its scene.
-        settings: the format's options, and where each was given.
+        settings: the options of every export (``Asked``) and the format's, and where each was
+            given.
         out: file or folder to write.
         on_progress: called after every file.
 
     Raises:
         UsageError: there is no such format, an option is unknown or out of range, or the format
-            cannot carry the whole model.
+            cannot carry the whole model and may not be lossy.
         DataError: a splat holds NaN or infinity, or a file cannot be written.
     """
+    from gsdmsr_cli.exports._source import Source  # brings torch
+
     exporter = cast(Exporter, plugins.load(__name__, format_.replace("-", "_")))
-    options = _read_options(format_, exporter.Options, settings)
-    if lost := exporter.lost(model, options):
-        raise UsageError(
-            f"--format {format_} cannot carry {' nor '.join(lost)} of this run; choose another "
-            f"format of {', '.join(format_names())}"
-        )
-    return exporter.write(model, facts, options, out, on_progress)
+    common, own = taken_apart(settings)
+    whole = getattr(exporter, "WHOLE", False)
+    options = _read_options(format_, exporter.Options, settings if whole else own)
+    asked = strict.build(Asked, common, f"--format {format_}")
+    axes = asked.axes or getattr(exporter, "AXES", "scene")
+    source = Source(model, replace(asked, axes=axes))
+    lost = [] if whole else _lost(format_, exporter, source, options)
+    files = exporter.write(source, facts, options, out, on_progress)
+    return Written(files, max(source.counts, default=len(model.splats)), lost)
+
+
+def _lost(format_: str, exporter: Exporter, source: Source, options: Any) -> list[str]:
+    """Return what the file will lack; raise UsageError if that was not agreed to or is too much."""
+    never = source.impossible_at(0.0)
+    lost = never if source.model.needs_camera else never + exporter.lost(source, options)
+    what = f"--format {format_} cannot carry {' nor '.join(lost)} of this run"
+    if never or (lost and not source.asked.lossy):
+        others = f"choose another format of {', '.join(format_names())}"
+        raise UsageError(f"{what}; {others}" + ("" if never else ", or leave it out with --lossy"))
+    if lost:
+        say.warn(f"{what}: left out")
+    return lost
 
 
 def _read_options(format_: str, cls: type[Any], settings: strict.Located) -> Any:

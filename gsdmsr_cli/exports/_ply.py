@@ -8,10 +8,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from gsdmsr_cli.exports._source import as_written
 from gsdmsr_cli.gaussians.splats import Splats
 from gsdmsr_cli.ground.errors import DataError
 from gsdmsr_cli.ground.files import replacing
-from gsdmsr_cli.model.model import Model
 from gsdmsr_cli.scene.vertices import read_vertices
 
 Array = NDArray[np.float32]
@@ -24,26 +24,6 @@ _SCALES = ("scale_0", "scale_1", "scale_2")
 _QUATS = ("rot_0", "rot_1", "rot_2", "rot_3")
 _REST_COUNTS = (0, 9, 24, 45)  # spherical harmonics of degree 0 to 3, without the constant
 
-_NOT_CARRIED = {
-    "axes": "axes that stand in place of rotations and scales",
-    "features": "features beside the colours",
-}
-"""What a moment of a model may have besides its splats, by the attribute that holds it."""
-
-
-def splats_at(model: Model, time: float) -> Splats:
-    """Return what a PLY carries of the model at ``time`` in [0, 1]: its splats."""
-    return model.at(model.instant(time)).splats
-
-
-def lost_at(model: Model, time: float) -> list[str]:
-    """Return what a PLY does not carry of the model at ``time`` in [0, 1], a phrase for each."""
-    if model.needs_camera:
-        return ["splats that depend on the camera"]
-    moment = model.at(model.instant(time))
-    lost = [text for name, text in _NOT_CARRIED.items() if getattr(moment, name) is not None]
-    return [*lost, "colours that are made after drawing"] if model.shades else lost
-
 
 def write_ply(path: Path, splats: Splats) -> None:
     """Write splats as the standard 3DGS PLY, little-endian float32.
@@ -55,13 +35,7 @@ def write_ply(path: Path, splats: Splats) -> None:
     Raises:
         DataError: a splat holds NaN or infinity, or the file cannot be written.
     """
-    table = _table(splats)
-    broken = int((~np.isfinite(table)).any(axis=1).sum())
-    if broken:
-        raise DataError(
-            f"{broken} of {len(table)} splats hold NaN or infinite values; {path} is not written: "
-            "export an earlier checkpoint or train again"
-        )
+    table = _table(as_written(splats, path))
     names = _column_names(3 * (splats.sh.shape[1] - 1))
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(table)}"]
     header += [f"property float {name}" for name in names] + ["end_header", ""]
@@ -88,7 +62,6 @@ def _column_names(rest: int) -> tuple[str, ...]:
 
 def _table(splats: Splats) -> Array:
     """Return the columns of the file, (N, 17 + 3 (K - 1)) little-endian float32."""
-    splats = splats.map(lambda tensor: tensor.detach().cpu())
     columns = [
         splats.means,
         torch.zeros_like(splats.means),
@@ -96,17 +69,9 @@ def _table(splats: Splats) -> Array:
         splats.sh[:, 1:].transpose(1, 2).flatten(1),
         splats.logit_opacities[:, None],
         splats.log_scales,
-        _unit_quats(splats.quats),
+        splats.quats,
     ]
-    table = torch.cat([column.float() for column in columns], dim=1)
-    return table.numpy().astype("<f4", copy=False)
-
-
-def _unit_quats(quats: torch.Tensor) -> torch.Tensor:
-    """Return (N, 4) quaternions of unit length; zero turns nothing, like the identity."""
-    wide = quats.double()
-    length = wide.norm(dim=1, keepdim=True)
-    return torch.where(length == 0, wide.new_tensor([1.0, 0.0, 0.0, 0.0]), wide / length)
+    return torch.cat(columns, dim=1).numpy().astype("<f4", copy=False)
 
 
 def _count_rest(path: Path, known: tuple[str, ...]) -> int:

@@ -10,11 +10,13 @@ from pathlib import Path
 from typing import cast
 
 from gsdmsr_cli.exports import Facts, RunFacts
+from gsdmsr_cli.exports._source import Source
 from gsdmsr_cli.ground.errors import DataError
 from gsdmsr_cli.ground.progress import OnProgress
-from gsdmsr_cli.model.model import Model
 from gsdmsr_cli.runs import checkpoints
 from gsdmsr_cli.runs.packing import pack
+
+WHOLE = True
 
 
 @dataclass(frozen=True)
@@ -22,13 +24,13 @@ class Options:
     """None."""
 
 
-def lost(model: Model, options: Options) -> list[str]:
+def lost(source: Source, options: Options) -> list[str]:
     """Return nothing: a run carries the whole model, at fewer bits a value."""
     return []
 
 
 def write(
-    model: Model, facts: Facts, options: Options, out: Path, on_progress: OnProgress
+    source: Source, facts: Facts, options: Options, out: Path, on_progress: OnProgress
 ) -> list[Path]:
     """Write the model to the run folder ``out``, which must be new or empty.
 
@@ -38,7 +40,7 @@ def write(
     """
     if out.exists() and not (out.is_dir() and not any(out.iterdir())):
         raise DataError(f"{out}: exists; --format compact writes a new run, choose another --out")
-    tensors, described = pack(model)
+    tensors, described = pack(source.model)
     run = cast(RunFacts, facts)
     run.describe(out)
     path = checkpoints.save_packed(out, tensors, described, run.step, run.progress)

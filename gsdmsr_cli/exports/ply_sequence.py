@@ -9,12 +9,12 @@ from pathlib import Path
 
 from gsdmsr_cli import __version__
 from gsdmsr_cli.exports import Facts
-from gsdmsr_cli.exports._ply import lost_at, splats_at, write_ply
+from gsdmsr_cli.exports._ply import write_ply
+from gsdmsr_cli.exports._source import Source
 from gsdmsr_cli.ground.errors import DataError, UsageError
 from gsdmsr_cli.ground.files import leftovers, read_json, write_json
 from gsdmsr_cli.ground.locks import sole_writer
 from gsdmsr_cli.ground.progress import OnProgress
-from gsdmsr_cli.model.model import Model
 from gsdmsr_cli.options.strict import require
 
 PREFIX = "frame"
@@ -57,13 +57,13 @@ class Options:
         return [i / max(count - 1, 1) for i in range(count)]
 
 
-def lost(model: Model, options: Options) -> list[str]:
+def lost(source: Source, options: Options) -> list[str]:
     """Return what the files cannot carry."""
-    return lost_at(model, options.moments()[0])
+    return source.lost_at(options.moments()[0])
 
 
 def write(
-    model: Model, facts: Facts, options: Options, out: Path, on_progress: OnProgress
+    source: Source, facts: Facts, options: Options, out: Path, on_progress: OnProgress
 ) -> list[Path]:
     """Write frame0001.ply, frame0002.ply, ... into the folder ``out``, in the order of time.
 
@@ -85,7 +85,7 @@ def write(
         try:
             _remove(part)
             for done, (name, time) in enumerate(zip(names, moments, strict=True), start=1):
-                write_ply(part / name, splats_at(model, time))
+                write_ply(part / name, source.at(time))
                 on_progress(done, len(names))
             _move_up(part, out, names)
         finally:

@@ -100,17 +100,29 @@ Gsdmsr = Any  # the fixture of conftest.py
         (
             "export r --format ply --time 0.5 --out o",
             "export",
-            (Path("r"), "ply", 0.5, None, [], Path("o")),
+            (Path("r"), "ply", {"time": 0.5}, [], Path("o")),
         ),
         (
             "export r --format ply-sequence --frames 3 --out o",
             "export",
-            (Path("r"), "ply-sequence", None, 3, [], Path("o")),
+            (Path("r"), "ply-sequence", {"frames": 3}, [], Path("o")),
         ),
         (
             "export r --format ply --set time=0.5 --set a=1 --out o",
             "export",
-            (Path("r"), "ply", None, None, ["time=0.5", "a=1"], Path("o")),
+            (Path("r"), "ply", {}, ["time=0.5", "a=1"], Path("o")),
+        ),
+        (
+            "export r --format ply --axes y-up --scale 2 --sh-degree 1 --min-opacity 0.1 --lossy"
+            " --out o",
+            "export",
+            (
+                Path("r"),
+                "ply",
+                {"axes": "y-up", "scale": 2, "sh_degree": 1, "min_opacity": 0.1, "lossy": True},
+                [],
+                Path("o"),
+            ),
         ),
         ("demo", "demo", (Path("gsdmsr-demo"),)),
         ("doctor --json", "doctor", ()),
@@ -193,7 +205,7 @@ def test_every_exporter_is_offered(gsdmsr: Gsdmsr) -> None:
     assert {"compact", "ply", "ply-sequence"} <= set(format_names())
     for name in format_names():
         assert gsdmsr(f"export r --format {name} --out o") == 0
-        assert gsdmsr.calls[-1] == ("export", (Path("r"), name, None, None, [], Path("o")))
+        assert gsdmsr.calls[-1] == ("export", (Path("r"), name, {}, [], Path("o")))
 
 
 def overrides_of(gsdmsr: Gsdmsr, options: str) -> tuple[str, ...]:

@@ -246,7 +246,7 @@ def test_a_missing_file_is_bad_data(tmp_path: Path) -> None:
 def write(kind: str, model: Any, out: Path, *counted: Any, **settings: Any) -> list[Path]:
     """Export with the options that are given; ``counted`` may be a list that gets the progress."""
     told = counted[0] if counted else []
-    return export(kind, model, FACTS, Located(settings), out, lambda *n: told.append(n))
+    return export(kind, model, FACTS, Located(settings), out, lambda *n: told.append(n)).files
 
 
 def test_ply_shows_the_moment_that_is_asked_for(tmp_path: Path) -> None:
