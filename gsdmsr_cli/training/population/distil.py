@@ -81,8 +81,7 @@ def start(options: Options, preset: Preset) -> Distil:
     """Return the event.
 
     Raises:
-        UsageError: the preset's motion has no base to take over from, or more groups than there
-            may be splats.
+        UsageError: the preset's motion has no base to take over from.
     """
     motion = preset.motion
     if not motion.get("base"):
@@ -91,7 +90,4 @@ def start(options: Options, preset: Preset) -> Distil:
             "from; write motion: {name: rigid_groups, base: {name: "
             f"{motion['name']}}}}}"
         )
-    groups, most = motion.get("count", 0), preset.density.cap
-    if groups > most:
-        raise UsageError(f"motion.count is {groups}; allowed: at most density.cap, which is {most}")
     return Distil(options)
