@@ -66,7 +66,7 @@ USAGE = {
         '--set losses.terms=[{"name":"rigidty"}]',
         "unknown term of the loss 'rigidty'; did you mean 'rigidity'",
     ),
-    "unknown layer": ('--set layers=[{"name":"fade"}]', "unknown layer 'fade'; known: none"),
+    "unknown layer": ('--set layers=[{"name":"fade"}]', "unknown layer 'fade'; known: colour, "),
     "no value": ("--set training.steps", "a.b=value"),
     "no mapping": ("--set training=3 --steps 4", "training is 3; allowed: a mapping"),
     "bad budget": ("--budget 8x", "allowed: null or a positive duration"),
