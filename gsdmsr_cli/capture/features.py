@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from gsdmsr_cli.ground.limits import cores
 from gsdmsr_cli.ground.progress import OnProgress
-from gsdmsr_cli.scene.native import cv2
+from gsdmsr_cli.scene.native import cv2, one_opencv_thread
 
 LONGEST = 960
 """Longer side at which features are searched [px]; finer ones cost time and add little."""
@@ -53,15 +53,13 @@ def write_features(
         np.savez(folder / path.stem, pixels=found.pixels, descriptors=found.descriptors)
 
     # a thread per picture, each by itself: the order of what OpenCV's own threads find varies
-    threads = cv2.getNumThreads()
-    cv2.setNumThreads(1)
-    pool = ThreadPoolExecutor(cores())
-    try:
-        for done, _ in enumerate(pool.map(work, pictures), start=1):
-            on_progress(done, len(pictures))
-    finally:
-        pool.shutdown(cancel_futures=True)
-        cv2.setNumThreads(threads)
+    with one_opencv_thread():
+        pool = ThreadPoolExecutor(cores())
+        try:
+            for done, _ in enumerate(pool.map(work, pictures), start=1):
+                on_progress(done, len(pictures))
+        finally:
+            pool.shutdown(cancel_futures=True)
 
 
 def read_features(folder: Path, name: str) -> Features:

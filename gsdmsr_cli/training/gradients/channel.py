@@ -23,6 +23,7 @@ from torch import Tensor
 
 from gsdmsr_cli.ground.errors import GsdmsrError
 from gsdmsr_cli.model.model import Model
+from gsdmsr_cli.scene.native import one_opencv_thread
 from gsdmsr_cli.training.gradients.phase import Order, Phase, ViewGradients
 from gsdmsr_cli.training.gradients.renderer import TrainingRenderer
 from gsdmsr_cli.training.gradients.shared_buffers import SharedBuffers
@@ -113,7 +114,8 @@ class ForkedChannel:
         given = theirs, [*(channel._pipe for channel in earlier), self._pipe], worker, prepare
         context = multiprocessing.get_context("fork")
         self._process: BaseProcess = context.Process(target=_serve, args=given, daemon=True)
-        self._process.start()
+        with one_opencv_thread():
+            self._process.start()
         theirs.close()
 
     def wait(self) -> None:

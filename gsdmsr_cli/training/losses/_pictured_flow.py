@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import math
 import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from hashlib import blake2b
 from pathlib import Path
 from zipfile import BadZipFile
@@ -20,7 +20,7 @@ from torch import Tensor
 from gsdmsr_cli.ground.errors import DataError
 from gsdmsr_cli.ground.files import replacing
 from gsdmsr_cli.scene.camera import Camera
-from gsdmsr_cli.scene.native import cv2
+from gsdmsr_cli.scene.native import cv2, one_opencv_thread
 from gsdmsr_cli.scene.optical_flow import Floats32, Grey, optical_flow, trusted
 from gsdmsr_cli.scene.pictures import HalvedPictures, Pictures
 from gsdmsr_cli.scene.scene import View
@@ -129,22 +129,11 @@ def _grey(picture: Tensor) -> Grey:
 
 def _consistent_flow(here: Grey, there: Grey) -> Floats32:
     """Return the flow as precisely as it is kept, so that first and later uses agree."""
-    with _one_thread():
+    with one_opencv_thread():
         forward, back = optical_flow(here, there), optical_flow(there, here)
         sure = trusted(forward, back, INCONSISTENT)
     rounded = (forward * STEPS).round() / STEPS
     return np.where(sure[..., None], rounded, np.nan).astype(np.float16).astype(np.float32)
-
-
-@contextlib.contextmanager
-def _one_thread() -> Iterator[None]:
-    """Let OpenCV use one thread: with more the flow is another, and forked processes hang."""
-    before = cv2.getNumThreads()
-    cv2.setNumThreads(1)
-    try:
-        yield
-    finally:
-        cv2.setNumThreads(before)
 
 
 def _read(path: Path, shape: tuple[int, ...]) -> Floats32 | None:

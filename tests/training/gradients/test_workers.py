@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import multiprocessing
+import signal
 import sys
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 from training_checks import (
     SETTLING,
@@ -23,6 +25,7 @@ from gsdmsr_cli.ground import plugins
 from gsdmsr_cli.ground.errors import DataError, GsdmsrError
 from gsdmsr_cli.model import motion as motions
 from gsdmsr_cli.scene.block_store import BlockStore
+from gsdmsr_cli.scene.native import cv2
 from gsdmsr_cli.training.trainer import Trainer
 
 every_motion = pytest.mark.parametrize("motion", plugins.names(motions.__name__))
@@ -150,3 +153,24 @@ def test_a_worker_that_cannot_prepare_says_so(tiny_scene: Path) -> None:
         trainer.start_workers(fail)
         with pytest.raises(DataError, match="no such thing"):
             trainer.workers.wait()
+
+
+@pytest.mark.usefixtures("two_threads")
+def test_workers_use_opencv_whose_threads_do_not_come_along(tiny_scene: Path) -> None:
+    picture, before = np.zeros((2000, 2000, 3), np.uint8), cv2.getNumThreads()
+
+    def use() -> None:
+        signal.alarm(20)  # ends a worker that waits for threads which it does not have
+        cv2.setNumThreads(1)
+        cv2.GaussianBlur(picture, (9, 9), 0)
+
+    cv2.setNumThreads(4)
+    try:
+        cv2.GaussianBlur(picture, (9, 9), 0)  # starts the threads
+        with trainer_of(tiny_scene, preset_of("training.views_per_step=2")) as trainer:
+            trainer.start_workers(use)
+            assert len(trainer.workers) == 2
+            trainer.workers.wait()
+            assert cv2.getNumThreads() == 4
+    finally:
+        cv2.setNumThreads(before)
