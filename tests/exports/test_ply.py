@@ -7,26 +7,23 @@ import json
 import re
 import subprocess
 import sys
-from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from export_checks import FACTS, Falling
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 from motion_checks import model_of, splats_at
 from torch import Tensor
 
-from gsdmsr_cli.exports import Facts, export
+from gsdmsr_cli.exports import export
 from gsdmsr_cli.exports._ply import read_ply, write_ply
-from gsdmsr_cli.gaussians.moment import Moment
 from gsdmsr_cli.gaussians.splats import Splats
 from gsdmsr_cli.ground import plugins
 from gsdmsr_cli.ground.errors import DataError, UsageError
-from gsdmsr_cli.model.layer import Instant, Layer
 from gsdmsr_cli.model.model import Model
 from gsdmsr_cli.options.strict import Located
 
@@ -37,21 +34,6 @@ def make_splats(n: int, degree: int, seed: int = 0) -> Splats:
     shapes = {"means": (3,), "quats": (4,), "log_scales": (3,), "logit_opacities": ()}
     shapes["sh"] = ((degree + 1) ** 2, 3)
     return Splats(**{k: 3 * torch.randn((n, *s), generator=generator) for k, s in shapes.items()})
-
-
-FACTS: Facts = SimpleNamespace(bound=1.0, frames=3)
-
-
-class Falling(Layer):
-    """Splats that fall by one unit; their moments have the axes and features that are given."""
-
-    def __init__(self, **beside: Tensor) -> None:
-        super().__init__()
-        self.beside = beside
-
-    def at(self, moment: Moment, instant: Instant) -> Moment:
-        way = torch.tensor([0.0, instant.time, 0.0])
-        return Moment(replace(moment.splats, means=moment.splats.means + way), **self.beside)
 
 
 def falling(splats: Splats, **beside: Tensor) -> Model:

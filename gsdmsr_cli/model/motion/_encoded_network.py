@@ -14,8 +14,7 @@ import torch
 from torch import Tensor
 
 from gsdmsr_cli.backends.cpu.simd import LANES
-from gsdmsr_cli.model.motion._grids import name_parameters
-from gsdmsr_cli.model.parameter import Parameter
+from gsdmsr_cli.model.parameter import Parameter, name_parameters
 from gsdmsr_cli.ops import network
 from gsdmsr_cli.ops.displace import OUTPUTS
 

@@ -6,10 +6,6 @@ from collections.abc import Sequence
 
 from torch import Tensor
 
-from gsdmsr_cli.model.parameter import name_parameters
-
-__all__ = ["name_parameters", "split_times", "time_nodes"]
-
 
 def split_times(rows: Tensor, count: int) -> Sequence[Tensor]:
     """Return the rows (N, K) of each of ``count`` times, which ``rows`` (count N, K) holds."""

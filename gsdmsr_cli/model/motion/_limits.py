@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 from gsdmsr_cli.backends.cuda.compiler import MOST_LEVELS
-from gsdmsr_cli.model.limits import require_multiples
 from gsdmsr_cli.options.strict import require
-
-__all__ = ["require_levels", "require_multiples", "require_resolutions"]
 
 
 def require_resolutions(options: object, *keys: str) -> None:

@@ -21,8 +21,8 @@ from torch import Tensor
 from gsdmsr_cli.gaussians.moment import Moment
 from gsdmsr_cli.gaussians.splats import Splats
 from gsdmsr_cli.model.layer import Facts, Instant, Layer
+from gsdmsr_cli.model.limits import require_multiples
 from gsdmsr_cli.model.motion._encoded_network import MOST_OCTAVES, Shape, new_encoded_network
-from gsdmsr_cli.model.motion._limits import require_multiples
 from gsdmsr_cli.ops.displace import PARTS
 from gsdmsr_cli.options.strict import require
 

@@ -18,8 +18,8 @@ from gsdmsr_cli.gaussians.moment import Moment
 from gsdmsr_cli.gaussians.splats import Splats
 from gsdmsr_cli.model.layer import Facts, Instant, Layer
 from gsdmsr_cli.model.limits import require_hash_levels, require_multiples
-from gsdmsr_cli.model.motion._grids import name_parameters, split_times
-from gsdmsr_cli.model.parameter import Parameter
+from gsdmsr_cli.model.motion._grids import split_times
+from gsdmsr_cli.model.parameter import Parameter, name_parameters
 from gsdmsr_cli.ops import hash_grid, network, planes
 from gsdmsr_cli.ops.displace import OUTPUTS, displace
 from gsdmsr_cli.options.strict import require

@@ -12,8 +12,10 @@ from torch import Tensor
 from gsdmsr_cli.gaussians.moment import Moment
 from gsdmsr_cli.gaussians.splats import Splats
 from gsdmsr_cli.model.layer import Facts, Instant, Layer
-from gsdmsr_cli.model.motion._grids import name_parameters, split_times, time_nodes
-from gsdmsr_cli.model.motion._limits import require_levels, require_multiples
+from gsdmsr_cli.model.limits import require_multiples
+from gsdmsr_cli.model.motion._grids import split_times, time_nodes
+from gsdmsr_cli.model.motion._limits import require_levels
+from gsdmsr_cli.model.parameter import name_parameters
 from gsdmsr_cli.ops import network, planes
 from gsdmsr_cli.ops.displace import OUTPUTS, PARTS, displace
 

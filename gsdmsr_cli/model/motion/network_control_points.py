@@ -20,9 +20,9 @@ from gsdmsr_cli.gaussians.moment import Moment
 from gsdmsr_cli.gaussians.splats import Splats
 from gsdmsr_cli.ground.geometry import as_rigid_as_possible
 from gsdmsr_cli.model.layer import Facts, Instant
+from gsdmsr_cli.model.limits import require_multiples
 from gsdmsr_cli.model.motion._control_points import ControlPoints, require_points
 from gsdmsr_cli.model.motion._encoded_network import MOST_OCTAVES, Shape, new_encoded_network
-from gsdmsr_cli.model.motion._limits import require_multiples
 from gsdmsr_cli.ops.displace import PARTS
 from gsdmsr_cli.options.strict import require
 

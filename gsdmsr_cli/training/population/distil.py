@@ -6,9 +6,7 @@ clustered, and what is drawn from then on, and trained, is one rigid movement pe
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 
@@ -17,7 +15,8 @@ from gsdmsr_cli.model.distilling import Distilling
 from gsdmsr_cli.model.model import STORED
 from gsdmsr_cli.options.preset import Preset
 from gsdmsr_cli.options.strict import require
-from gsdmsr_cli.training.population import Event, Tick
+from gsdmsr_cli.training.population import Tick
+from gsdmsr_cli.training.population._once import Once
 from gsdmsr_cli.training.resizing import Population
 
 
@@ -35,19 +34,8 @@ class Options:
         require(self, "at", 0 <= self.at <= 1, "a progress from 0 to 1")
 
 
-class Distil(Event):
-    """Happens once, when the splats move.
-
-    Attributes:
-        done: whether it has happened.
-    """
-
-    def __init__(self, options: Options) -> None:
-        self.options, self.done = options, False
-
-    def due(self, tick: Tick) -> bool:
-        """Return whether the progress has been reached."""
-        return not self.done and tick.progress >= self.options.at
+class Distil(Once):
+    """Happens once, when the splats move."""
 
     @torch.no_grad()
     def apply(self, population: Population, tick: Tick) -> None:
@@ -68,14 +56,6 @@ class Distil(Event):
             optimizer.reset_moments(name, second=False)
         population.average.clear()
 
-    def state(self) -> dict[str, Any]:
-        """Return whether it has happened."""
-        return {"done": self.done}
-
-    def restore(self, state: Mapping[str, Any]) -> None:
-        """Return to what ``state`` returned."""
-        self.done = bool(state["done"])
-
 
 def start(options: Options, preset: Preset) -> Distil:
     """Return the event.
@@ -90,4 +70,4 @@ def start(options: Options, preset: Preset) -> Distil:
             "from; write motion: {name: rigid_groups, base: {name: "
             f"{motion['name']}}}}}"
         )
-    return Distil(options)
+    return Distil(options.at)

@@ -51,7 +51,7 @@ def test_what_is_drawn_then_is_near_what_was_drawn_before(tiny_scene: Path) -> N
     still = model.splats.means.detach().clone()
     with torch.no_grad():
         before = [model.at(model.instant(time)).splats.means for time in (0.0, 0.4, 1.0)]
-        Distil(Options()).apply(trainer.population, Tick(STEPS, 1.0))
+        Distil(Options().at).apply(trainer.population, Tick(STEPS, 1.0))
         after = [model.at(model.instant(time)).splats.means for time in (0.0, 0.4, 1.0)]
     for one, two in zip(before, after, strict=True):
         assert (one - two).norm(dim=1).mean() < 0.2 * (one - still).norm(dim=1).mean()
