@@ -34,7 +34,8 @@ class Terms:
         background: "white" or "black".
         split: the views that are compared, "test" or "val".
         lpips_weights: folder of weights, or None for the usual places.
-        jobs: how many run side by side, each on its share of the cores.
+        jobs: how many run side by side.
+        cpu_threads: of each, None for its share of the cores.
     """
 
     downscale: int
@@ -42,10 +43,13 @@ class Terms:
     split: str
     lpips_weights: Path | None
     jobs: int = 1
+    cpu_threads: int | None = None
 
     @property
     def threads(self) -> int | None:
         """CPU threads of each, None for what its preset says."""
+        if self.cpu_threads is not None:
+            return self.cpu_threads
         return cores() // self.jobs if self.jobs > 1 else None
 
 

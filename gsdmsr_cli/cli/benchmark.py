@@ -67,6 +67,9 @@ def scenes(
         int,
         typer.Option(min=1, metavar="N", help="Trials side by side, each on its share of cores."),
     ] = 1,
+    threads: Annotated[
+        int | None, typer.Option(min=1, metavar="N", help="CPU threads of each trial.")
+    ] = None,
 ) -> None:
     """Train presets on scenes at equal lengths and print the table of their scores."""
     lengths: list[str | int] = [*(budget or []), *(steps or [])]
@@ -75,7 +78,7 @@ def scenes(
     from gsdmsr_cli.benchmark.trials import Terms
     from gsdmsr_cli.commands import benchmark_scenes as command
 
-    terms = Terms(downscale, background, split, lpips_weights, jobs)
+    terms = Terms(downscale, background, split, lpips_weights, jobs, threads)
     presets: list[str | Path] = [*(preset or []), *(config or [])]
     command.run(folders, out, presets or ["dnerf"], lengths, seed or [0], terms)
 

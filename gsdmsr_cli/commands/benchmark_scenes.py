@@ -42,8 +42,9 @@ def run(
         GsdmsrError: a trial has failed.
         KeyboardInterrupt: Ctrl-C; the same command goes on.
     """
-    if terms.jobs > cores():
-        raise UsageError(f"--jobs {terms.jobs}: this machine has {cores()} cores, give no more")
+    if terms.jobs * (terms.threads or 1) > cores():
+        asked = f"--jobs {terms.jobs}" + (f" of {terms.threads} threads" if terms.threads else "")
+        raise UsageError(f"{asked}: this machine has {cores()} cores, give no more")
     trials = all_trials(scenes, presets, lengths, seeds)
     for trial in trials:  # an error now rather than after hours
         trial.options(terms)

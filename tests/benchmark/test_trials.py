@@ -271,9 +271,15 @@ def test_trials_side_by_side_share_the_cores(tiny_scene: Path, tmp_path: Path) -
 
 def test_more_trials_at_once_than_cores_are_refused(tiny_scene: Path, tmp_path: Path) -> None:
     line = ["benchmark", "scenes", tiny_scene, "--out", tmp_path / "out", "--steps", STEPS]
-    done = gsdmsr(*line, "--jobs", cores() + 1)
-    assert (done.returncode, done.stdout) == (2, "")
-    assert f"this machine has {cores()} cores" in done.stderr
+    for asked in ("--jobs", cores() + 1), ("--jobs", 1, "--threads", cores() + 1):
+        done = gsdmsr(*line, *asked)
+        assert (done.returncode, done.stdout) == (2, "")
+        assert f"this machine has {cores()} cores" in done.stderr
+
+
+def test_trials_have_the_threads_that_were_asked_for(tiny_scene: Path) -> None:
+    trial, terms = Trial(tiny_scene, "static", STEPS, 0), Terms(1, "white", "test", None, 1, 3)
+    assert trial.options(terms).training.threads == 3
 
 
 @pytest.mark.parametrize(
