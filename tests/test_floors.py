@@ -13,7 +13,8 @@ from gsdmsr_cli.backends.cpu import jit
 
 PACKAGE = Path(gsdmsr_cli.__file__).parent
 ROOMS = (
-    "ground", "backends", "options", "gaussians", "scene", "ops", "raster", "model", "drawing",
+    "ground", "backends", "options", "gaussians", "scene", "ops", "raster", "model", "moving",
+    "drawing",
     "runs", "formats", "exports", "paths", "evaluation", "filming", "reporting", "training",
     "capture", "demo", "benchmark", "commands", "cli",
 )  # fmt: skip

@@ -48,6 +48,14 @@ def export(
     lossy: Annotated[
         bool, typer.Option("--lossy", help="Leave out what the format cannot carry.")
     ] = False,
+    loss: Annotated[
+        float | None,
+        typer.Option(metavar="DB", help="PSNR that coding may cost in files that are played."),
+    ] = None,
+    data: Annotated[
+        Path | None,
+        typer.Option(metavar="DIR", help="Where the data lies now, to measure that loss."),
+    ] = None,
     set_: Annotated[
         list[str] | None,
         typer.Option("--set", metavar="a=v", help="One option of the format; repeatable."),
@@ -64,6 +72,7 @@ def export(
         "sh_degree": sh_degree,
         "min_opacity": min_opacity,
         "lossy": lossy or None,
+        "loss": loss,
     }
     named = {key: value for key, value in given.items() if value is not None}
-    command.run(run_folder, format_, named, set_ or [], out)
+    command.run(run_folder, format_, named, set_ or [], out, data)

@@ -56,7 +56,7 @@ def _trained(run: Run) -> dict[str, Any]:
         **psnr,
         "checkpoint_bytes": run.checkpoint_path.stat().st_size,
         **protocol.storage(checkpoint.sizes()),
-        "evaluated": (run.root / EVALUATION / METRICS).is_file(),
+        "evaluated": (run.results / EVALUATION / METRICS).is_file(),
     }
 
 
@@ -66,7 +66,10 @@ def _data(run: Run) -> dict[str, Any]:
     Raises:
         DataError: what is there is not what the run was trained on, or cannot be read.
     """
-    there = run.data.is_dir()
-    if there and not needs_preparing(run.data):
-        run.check_scene(read_scene(run.data))
-    return {"data": str(run.data), "layout": run.layout, "data_is_there": there}
+    place = run.data
+    if place is None:
+        return {"layout": run.layout}
+    there = place.is_dir()
+    if there and not needs_preparing(place):
+        run.check_scene(read_scene(place))
+    return {"data": str(place), "layout": run.layout, "data_is_there": there}

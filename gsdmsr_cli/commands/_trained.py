@@ -63,8 +63,10 @@ def open_trained(
         DataError: the run or its data cannot be used, or do not belong together.
     """
     run, model, checkpoint = open_with_model(folder)
-    with one_of_readers(data or run.data):
-        scene = _read_data(run, data)
+    place = _place_of_data(run, data)
+    with one_of_readers(place):
+        scene = read_scene(place)
+        run.check_scene(scene)
         if verify:
             check_whole(run.root, scene)
         renderer, device = _renderer(run, model, background, downscale)
@@ -85,12 +87,17 @@ def _renderer(
     return ViewRenderer(model.to(device), raster.best_engine(device), pictures, behind), device
 
 
-def _read_data(run: Run, data: Path | None) -> Scene:
-    if data is None and not run.data.is_dir():
+def _place_of_data(run: Run, data: Path | None) -> Path:
+    """Return the folder of a run's data; raise DataError if it is not where it was."""
+    place = data or run.data
+    if place is None:
         raise DataError(
-            f"{run.data}: the data that {run.root} was trained on is not there any more; "
+            f"{run.root}: does not say where the data lies that it was trained on; say so with "
+            "--data"
+        )
+    if data is None and not place.is_dir():
+        raise DataError(
+            f"{place}: the data that {run.root} was trained on is not there any more; "
             "say with --data where it is"
         )
-    scene = read_scene(data or run.data)
-    run.check_scene(scene)
-    return scene
+    return place

@@ -54,7 +54,10 @@ def run(
     with ExitStack() as held:
         given = run_folder, data, background, request.downscale, request.verify_data
         trained = held.enter_context(open_trained(*given))
-        protocol, folder = describe(trained, request), output.folder or run_folder / EVALUATION
+        protocol, folder = (
+            describe(trained, request),
+            output.folder or trained.run.results / EVALUATION,
+        )
         if gates.baseline:
             gates.baseline.require_same(protocol)
         held.enter_context(sole_writer(folder))

@@ -54,7 +54,12 @@ def look_at(path: Path) -> Found:
 
 def _file(path: Path) -> Found:
     from gsdmsr_cli.commands import _info_files as files
+    from gsdmsr_cli.runs.moving_file import is_moving_file
 
+    if is_moving_file(path):
+        from gsdmsr_cli.commands._info_run import run_found
+
+        return run_found(path)
     suffix = path.suffix.lower()
     if suffix == ".ply":
         return files.ply_found(path)

@@ -49,7 +49,7 @@ def run(run_folder: Path, request: Request, out: Path | None, data: Path | None 
 def _draw(trained: Trained, request: Request, out: Path | None, held: ExitStack) -> None:
     """Draw all films, whose folders are ``held`` meanwhile."""
     films = [_film(trained, path, request) for path in ([request.path] if request.path else USUAL)]
-    target, origin = out or trained.run.root / FILMS, _origin(trained, request)
+    target, origin = out or trained.run.results / FILMS, _origin(trained, request)
     prepared = []
     require_folder(target)
     held.enter_context(one_of_readers(target))

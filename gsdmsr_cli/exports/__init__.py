@@ -19,6 +19,7 @@ from gsdmsr_cli.ground.progress import OnProgress
 from gsdmsr_cli.options import strict
 
 if TYPE_CHECKING:  # Model brings torch, which --help must not wait for
+    from gsdmsr_cli.drawing.judging import Judge
     from gsdmsr_cli.exports._source import Source
     from gsdmsr_cli.model.model import Model
 
@@ -36,7 +37,7 @@ class Facts(Protocol):
 
 
 class RunFacts(Facts, Protocol):
-    """What the command gives beside it, for a format that is a run folder itself."""
+    """What the command gives beside it, for formats that are a run themselves or are played."""
 
     @property
     def step(self) -> int:
@@ -49,13 +50,26 @@ class RunFacts(Facts, Protocol):
     def describe(self, folder: Path) -> None:
         """Write to a new folder what the run's own says of its options, its scene and pictures."""
 
+    def about(self) -> dict[str, Any]:
+        """Return the run's options and scene as plain JSON, without any place on this machine."""
+
+    def shown(self, model: Model) -> dict[str, Any]:
+        """Return what a player is told of the scene, see docs/file-format.md."""
+
+    def judge(self, model: Model) -> Judge:
+        """Return what compares others with a model.
+
+        Raises:
+            DataError: the data is not the run's, or its pictures cannot be read.
+        """
+
 
 class Exporter(Protocol):
     """What a module of this package offers beside its ``Options``.
 
     A module whose format prescribes axes names them in ``AXES``, see ``Asked.axes``. One that
     writes the model itself in place of its splats says ``WHOLE = True``, and takes none of
-    ``Asked``.
+    ``Asked``. One that has rotations and scales of its own making says ``BAKES = True``.
     """
 
     Options: type[Any]
@@ -90,11 +104,13 @@ class Written:
         files: that were written.
         splats: in a file; in the one that has most.
         lost: what they lack of the model, a phrase for each.
+        details: what the format has to tell of them, plain JSON.
     """
 
     files: list[Path]
     splats: int
     lost: list[str]
+    details: dict[str, Any]
 
 
 def export(
@@ -132,12 +148,13 @@ def export(
     source = Source(model, replace(asked, axes=axes))
     lost = [] if whole else _lost(format_, exporter, source, options)
     files = exporter.write(source, facts, options, out, on_progress)
-    return Written(files, max(source.counts, default=len(model.splats)), lost)
+    splats = max(source.counts, default=len(model.splats))
+    return Written(files, splats, lost, source.details)
 
 
 def _lost(format_: str, exporter: Exporter, source: Source, options: Any) -> list[str]:
     """Return what the file will lack; raise UsageError if that was not agreed to or is too much."""
-    never = source.impossible_at(0.0)
+    never = source.impossible_at(0.0, getattr(exporter, "BAKES", False))
     lost = never if source.model.needs_camera else never + exporter.lost(source, options)
     what = f"--format {format_} cannot carry {' nor '.join(lost)} of this run"
     if never or (lost and not source.asked.lossy):

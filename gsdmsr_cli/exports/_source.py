@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -35,11 +36,13 @@ class Source:
         model: what is written.
         asked: axes, units, harmonics and which splats.
         counts: of the splats at each time that has been asked for; grows.
+        details: what a format has to tell of its files, plain JSON; grows.
     """
 
     model: Model
     asked: Asked
     counts: list[int] = field(default_factory=list)
+    details: dict[str, Any] = field(default_factory=dict)
 
     def at(self, time: float) -> Splats:
         """Return the splats at ``time`` in [0, 1] that are to be written, which may hold NaN."""
@@ -59,11 +62,14 @@ class Source:
         """The degree of the harmonics that are to be written."""
         return self.model.splats.degree_up_to(self.asked.sh_degree)
 
-    def impossible_at(self, time: float) -> list[str]:
-        """Return what keeps the splats at ``time`` from being written at all, a phrase for each."""
+    def impossible_at(self, time: float, bakes: bool = False) -> list[str]:
+        """Return what keeps the splats at ``time`` from being written at all, a phrase for each.
+
+        ``bakes`` says that the format has rotations and scales of its own.
+        """
         if self.model.needs_camera:
             return ["splats that depend on the camera"]
-        return self._beside(time, "axes")
+        return [] if bakes else self._beside(time, "axes")
 
     def lost_at(self, time: float) -> list[str]:
         """Return what is more to the model at ``time`` in [0, 1] than splats, a phrase for each."""

@@ -7,7 +7,7 @@ field.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -53,6 +53,23 @@ class Instant:
     time: float
     camera: Camera | None = None
     jitter: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class Following:
+    """What the splats of a layer follow, as ``ops.skin`` has it.
+
+    Attributes:
+        points: (B, 3) canonical places [world units].
+        log_radii: (B,) how far they reach; None where a splat follows one alone.
+        near: how many of the nearest a splat follows, or (N,) int64, the one that it follows.
+        movement: returns (B, 10) of the points at a time in [0, 1], see ``ops.skin.transforms``.
+    """
+
+    points: Tensor
+    log_radii: Tensor | None
+    near: int | Tensor
+    movement: Callable[[float], Tensor]
 
 
 class Layer(ABC):
@@ -172,6 +189,19 @@ class Layer(ABC):
             the names of the parameters that have new values.
         """
         return ()
+
+    def following(self) -> Following | None:
+        """Return what splats follow, if this layer does no more than let them follow it."""
+        return None
+
+    def lives(self, splats: Splats) -> Tensor | None:
+        """Return when the N splats that it is given are there, (N, 4), or None if always.
+
+        The columns are the first and the last time at which a splat is there in full, and natural
+        logarithms of two durations d: of appearing and of vanishing. At a distance e before the
+        first or after the last time exp(-(e / d)^2) of its opacity is left.
+        """
+        return None
 
     def kept(self) -> Tensor | None:
         """Return which of the splats that it is given are ever drawn, (N,) bool; None if all."""

@@ -116,15 +116,24 @@ class Model:
         """
         canonical = Moment(self.splats)
         with computing_in(self.precision):
-            begun = [canonical]
-            for layer in self._before_motion(True):
-                begun = self._through(layer, begun, instants[:1])
-            moments = begun * len(instants)
+            moments = [self._begun(canonical, instants[0])] * len(instants)
             for layer in self._before_motion(False):
                 moments = self._through(layer, moments, instants)
         if gradient_mask is None:
             return moments
         return [mask_gradients(canonical, moment, gradient_mask) for moment in moments]
+
+    def canonical(self) -> Moment:
+        """Return what the motion is given: the canonical splats after the layers before it."""
+        with computing_in(self.precision):
+            return self._begun(Moment(self.splats), Instant(0.0))
+
+    def _begun(self, canonical: Moment, instant: Instant) -> Moment:
+        """Return the canonical splats after the layers before the motion, whatever the instant."""
+        moments = [canonical]
+        for layer in self._before_motion(True):
+            moments = self._through(layer, moments, [instant])
+        return moments[0]
 
     def shade(self, frame: Frame, instant: Instant) -> Frame:
         """Return the frame after all layers that make colours anew."""

@@ -38,7 +38,7 @@ from gsdmsr_cli.model.model import Model
 from gsdmsr_cli.options import strict
 from gsdmsr_cli.options.preset import Preset
 from gsdmsr_cli.options.renamed import with_present_names
-from gsdmsr_cli.runs import checkpoints, earlier, log, seen_pictures
+from gsdmsr_cli.runs import checkpoints, earlier, log, moving_file, seen_pictures
 from gsdmsr_cli.runs.checkpoints import LAST, SCHEMA, WRONG, Checkpoint
 from gsdmsr_cli.scene.picture_hashes import digest
 from gsdmsr_cli.scene.scene import Scene
@@ -56,7 +56,7 @@ class Run:
         name: of the preset, or of the file of options, that the training began from.
         preset: all options of the training.
         facts: what the layers may know of the scene.
-        data: folder of the scene, absolute when the run was made.
+        data: folder of the scene, absolute when the run was made; None if that is not told.
         layout: format of the scene.
         fingerprint: of the scene's layout files.
         reason: which preset the data has called for, and why; None where it was named.
@@ -67,7 +67,7 @@ class Run:
     name: str
     preset: Preset
     facts: Facts
-    data: Path
+    data: Path | None
     layout: str
     fingerprint: str
     reason: str | None = None
@@ -79,9 +79,19 @@ class Run:
         return self.root / _LOG
 
     @property
+    def is_file(self) -> bool:
+        """Whether it is a file that stands for a run, see ``runs.moving_file``."""
+        return moving_file.is_moving_file(self.root)
+
+    @property
+    def results(self) -> Path:
+        """The folder in which commands write what they make of the run, if told no other."""
+        return moving_file.results_of(self.root) if self.is_file else self.root
+
+    @property
     def checkpoint_path(self) -> Path:
         """The last checkpoint."""
-        return self.root / LAST
+        return self.root if self.is_file else self.root / LAST
 
     @property
     def training_path(self) -> Path:
@@ -101,7 +111,11 @@ class Run:
 
     def describe(self) -> None:
         """Write what the run is, in place of what was said before."""
-        about = {
+        write_json(self.root / _ABOUT, self.about())
+
+    def about(self) -> dict[str, Any]:
+        """Return what the run is, as plain JSON."""
+        return {
             "schema": SCHEMA,
             "gsdmsr": __version__,
             "torch": torch.__version__,
@@ -110,13 +124,12 @@ class Run:
             "preset": strict.dump(self.preset),
             "facts": asdict(self.facts),
             "data": {
-                "path": str(self.data),
+                "path": None if self.data is None else str(self.data),
                 "layout": self.layout,
                 "fingerprint": self.fingerprint,
                 "pictures": self.pictures,
             },
         }
-        write_json(self.root / _ABOUT, about)
 
     def describe_at(self, root: Path) -> None:
         """Describe a run of the same options and scene in another folder, which is made.
@@ -221,6 +234,8 @@ class Run:
         Raises:
             DataError: there is none, or it is not what the run's description says.
         """
+        if self.is_file:
+            return moving_file.load(self.root)
         checkpoint = self.load()
         preset, progress = self.preset, checkpoint.progress
         given = preset.motion, preset.layers, self.facts, progress, preset.training.precision
@@ -308,15 +323,18 @@ def continue_run(run: Run, preset: Preset, scene: Scene) -> Run:
 
 
 def open_run(root: Path) -> Run:
-    """Open a run folder.
+    """Open a run folder, or a file that stands for one.
 
     Raises:
         DataError: the folder is missing or not a run, or its description is damaged.
     """
     path = root / _ABOUT
-    if not path.is_file():
+    if moving_file.is_moving_file(root):
+        path, about = root, moving_file.about(root)
+    elif not path.is_file():
         raise DataError(f"{root}: not a run folder (no {_ABOUT}); give one that train wrote")
-    about = read_json(path)
+    else:
+        about = read_json(path)
     if about.get("schema") not in _READ:
         known = " and ".join(map(str, _READ))
         raise DataError(f"{path}: has schema {about.get('schema')}; this version reads {known}")
@@ -329,7 +347,7 @@ def open_run(root: Path) -> Run:
             str(about["name"]),
             strict.build(Preset, options, "preset"),
             strict.build(Facts, about["facts"], "facts"),
-            Path(about["data"]["path"]),
+            None if about["data"]["path"] is None else Path(about["data"]["path"]),
             str(about["data"]["layout"]),
             str(about["data"]["fingerprint"]),
             about.get("reason"),
@@ -342,7 +360,7 @@ def open_run(root: Path) -> Run:
 def open_with_model(root: Path) -> tuple[Run, Model, Checkpoint]:
     """Open a run folder and read the model of its last checkpoint, both of one training.
 
-    A training may go on there, or another begin: then they are read again.
+    A file may stand for both. Where a training goes on, or another begins, they are read again.
 
     Raises:
         DataError: see ``open_run`` and ``Run.load_model``.

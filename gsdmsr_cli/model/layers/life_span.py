@@ -11,6 +11,7 @@ import math
 from dataclasses import dataclass, replace
 
 import torch
+from torch import Tensor
 
 from gsdmsr_cli.gaussians.fading import fade
 from gsdmsr_cli.gaussians.moment import Moment
@@ -72,6 +73,12 @@ class LifeSpan(Layer):
         late = (instant.time - last).relu() * inverse_durations(self.log_vanishing)
         opacities = fade(moment.splats.logit_opacities, early.square() + late.square())
         return replace(moment, splats=replace(moment.splats, logit_opacities=opacities))
+
+    def lives(self, splats: Splats) -> Tensor:
+        """Return the two times in order, and both durations."""
+        times = torch.stack([self.starts, self.ends], dim=1).sort(dim=1).values
+        durations = torch.stack([self.log_appearing, self.log_vanishing], dim=1)
+        return torch.cat([times, durations], dim=1).detach()
 
 
 def start(options: Options, facts: Facts, splats: Splats, generator: torch.Generator) -> LifeSpan:

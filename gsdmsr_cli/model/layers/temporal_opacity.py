@@ -63,6 +63,11 @@ class TemporalOpacity(Layer):
         opacities = fade(moment.splats.logit_opacities, apart.square())
         return replace(moment, splats=replace(moment.splats, logit_opacities=opacities))
 
+    def lives(self, splats: Splats) -> Tensor:
+        """Return lives whose first time is the last: the centres."""
+        duration = self.log_durations
+        return torch.stack([self.centres, self.centres, duration, duration], dim=1).detach()
+
     def begin_at(self, times: Tensor) -> None:
         """Let splats be seen around the times at which their points were."""
         take_known(self.centres, times)

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from gsdmsr_cli.gaussians.moment import Moment
 from gsdmsr_cli.gaussians.splats import Splats
-from gsdmsr_cli.model.layer import Facts, Instant, Layer
+from gsdmsr_cli.model.layer import Facts, Following, Instant, Layer
 from gsdmsr_cli.model.parameter import Parameter
 from gsdmsr_cli.ops import skin, spread
 from gsdmsr_cli.ops.nearest import Nearest
@@ -103,6 +103,14 @@ class ControlPoints(Layer):
         return (
             known is not None and known.data_ptr() == means.data_ptr() and len(known) == len(means)
         )
+
+    def following(self) -> Following | None:
+        """Return the control points, and how they move."""
+
+        def movement(time: float) -> Tensor:
+            return self._deformation(self.control_points, time)
+
+        return Following(self.control_points, self.log_radii, self._kept, movement)
 
     def reanchor(self, splats: Splats) -> Sequence[str]:
         """Spread the control points evenly over the present splats that are not transparent.

@@ -134,6 +134,11 @@ class Covariance4D(Layer):
         summed = waves[:, None] @ sh.flatten(2)
         return summed.view(len(sh), *sh.shape[2:])
 
+    def lives(self, splats: Splats) -> Tensor:
+        """Return lives about the times of the means, as long as the marginals."""
+        durations = (2 * self._slices(splats, slice(None)).variances).log() / 2
+        return torch.stack([self.times, self.times, durations, durations], dim=1).detach()
+
     def begin_at(self, times: Tensor) -> None:
         """Let splats be seen around the times at which their points were."""
         take_known(self.times, times)

@@ -19,7 +19,7 @@ from torch import Tensor
 from gsdmsr_cli.gaussians.moment import Moment
 from gsdmsr_cli.gaussians.splats import Splats
 from gsdmsr_cli.ground.geometry import as_rigid_as_possible
-from gsdmsr_cli.model.layer import Facts, Instant
+from gsdmsr_cli.model.layer import Facts, Following, Instant
 from gsdmsr_cli.model.limits import require_multiples
 from gsdmsr_cli.model.motion._control_points import ControlPoints, require_points
 from gsdmsr_cli.model.motion._encoded_network import MOST_OCTAVES, Shape, new_encoded_network
@@ -87,6 +87,10 @@ class NetworkControlPoints(ControlPoints):
     def _deformation(self, points: Tensor, time: float) -> Tensor:
         """Return the network's outputs, without a gradient for the points by way of it."""
         return self.network.apply(points.detach() / self.facts.bound, [time])[0]
+
+    def following(self) -> Following | None:
+        """Return the control points, unless every splat is one by itself."""
+        return super().following() if self.progress >= self.options.alone_until else None
 
     def advance(self, progress: float) -> None:
         """Enter the stage of ``progress``."""

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from gsdmsr_cli.gaussians.moment import Moment
 from gsdmsr_cli.gaussians.splats import Splats
-from gsdmsr_cli.model.layer import Facts, Instant, options_of
+from gsdmsr_cli.model.layer import Facts, Following, Instant, options_of
 from gsdmsr_cli.model.motion import _grouping as grouping
 from gsdmsr_cli.model.motion._grids import time_nodes
 from gsdmsr_cli.model.motion._taking_over import PACKAGE, TakingOver
@@ -90,11 +90,19 @@ class RigidGroups(TakingOver):
             return super().at_instants(moment, instants)
         return [replace(moment, splats=self._moved(moment.splats, i.time)) for i in instants]
 
-    def _moved(self, splats: Splats, time: float) -> Splats:
+    def following(self) -> Following | None:
+        """Return the groups, once they have taken over."""
+        if not self.active:
+            return None if self.base is None else self.base.following()
+        return Following(self.anchors, None, self.group[:, 0].long(), self._movements)
+
+    def _movements(self, time: float) -> Tensor:
         place = min(max(time, 0.0), 1.0) * (len(self.keys) - 1)
         before = min(int(place), len(self.keys) - 2)
-        movements = torch.lerp(self.keys[before], self.keys[before + 1], place - before)
-        transforms = skin.transforms(self.anchors, movements)
+        return torch.lerp(self.keys[before], self.keys[before + 1], place - before)
+
+    def _moved(self, splats: Splats, time: float) -> Splats:
+        transforms = skin.transforms(self.anchors, self._movements(time))
         radii = self.anchors.new_zeros(len(self.anchors))  # one point alone has all the weight
         return skin.skin(splats, self.anchors, radii, transforms, self.group)
 

@@ -102,6 +102,11 @@ class Vibration(Layer):
         turn = 2 * math.pi / self.options.period
         return torch.sin(turn * since) / turn
 
+    def lives(self, splats: Splats) -> Tensor:
+        """Return lives about the peaks."""
+        durations = self._life_spans().log() + 0.5 * math.log(2)
+        return torch.stack([self.peaks, self.peaks, durations, durations], dim=1).detach()
+
     def begin_at(self, times: Tensor) -> None:
         """Let lives have their peaks at the times at which splats were seen."""
         take_known(self.peaks, times)

@@ -1,0 +1,226 @@
+"""What has been baked to parts of a file and back, as coarsely as steps say."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gsdmsr_cli.gaussians.splats import Splats
+from gsdmsr_cli.moving.baked import COLOURS, OF_BODIES, OF_SPLATS, Baked, Bodies
+from gsdmsr_cli.moving.curves import Track
+from gsdmsr_cli.moving.parts import Floats, Part, plain_part, short, signed_part, values_of
+from gsdmsr_cli.moving.places import NAME as MEANS
+from gsdmsr_cli.moving.places import code_places, places_of
+from gsdmsr_cli.moving.playing import UNSEEN
+
+Steps = Mapping[str, float]
+"""How coarse each part is: the difference of two values that can be told apart, by its name. Those
+of tracks are of their channels; those of places are in units of the bound, near the origin."""
+
+FIXED = {"points": 2.0**-14, "log_radii": 2.0**-7, "times": 2.0**-12, "log_durations": 2.0**-6}
+"""Steps of what takes few bytes; ``points`` in units of the bound."""
+
+FINER = 0.25
+"""Rounding curves adds this much of what rounding shares does."""
+
+CURVES, SHARES = "curves/", "shares/"
+
+_TO_YCOCG = np.array([[0.25, 0.5, 0.25], [0.5, 0.0, -0.5], [-0.25, 0.5, -0.25]])
+_TO_RGB = np.linalg.inv(_TO_YCOCG)
+
+
+def steps_named(baked: Baked) -> dict[str, float]:
+    """Return the steps of all parts whose coarseness matters, as fine as anybody can see.
+
+    What they are in relation to one another is for the search (``moving.choosing``) to find.
+    """
+    names = {"means": 2.0**-13, "quats": 2.0**-7, "log_scales": 2.0**-5, "opacities": 2.0**-7}
+    names |= {"sh_0": 2.0**-6}
+    if baked.splats.sh_degree:
+        names["sh_rest"] = 2.0**-6
+    of_tracks = {"offset": 2.0**-11, "turn": 2.0**-8, "growth": 2.0**-6, "opacity": 2.0**-7}
+    of_tracks |= {"sh": 2.0**-6}
+    return names | {name: of_tracks[name.partition("/")[2]] for name in baked.tracks}
+
+
+def coded(baked: Baked, steps: Steps, bound: float) -> list[Part]:
+    """Return the parts of a file, the splats in an order that takes few bytes.
+
+    Args:
+        baked: what is coded.
+        steps: of all that ``steps_named`` names.
+        bound: half edge of the cube that holds the scene [world units].
+    """
+    means = _array(baked.splats.means)
+    places, rows = code_places(means, baked.moving, steps["means"], bound)
+    order = torch.from_numpy(rows)
+    splats, first = baked.splats.take(order), order[: baked.moving]
+    parts = [places, *_splat_parts(splats, steps)]
+    if baked.lives is not None:
+        times, durations = _array(baked.lives[first]).clip(-64, 64), FIXED["log_durations"]
+        parts.append(plain_part("lives", times, np.array([FIXED["times"]] * 2 + [durations] * 2)))
+    if baked.bodies is not None:
+        parts += _bodies_parts(baked.bodies, first, bound)
+    for name, track in baked.tracks.items():
+        held = track if name in OF_BODIES else replace(track, shares=track.shares[first])
+        scale = bound if name.endswith("/offset") else 1.0
+        parts += _track_parts(name, held, steps[name] * scale)
+    return parts
+
+
+def _splat_parts(splats: Splats, steps: Steps) -> list[Part]:
+    colours = _array(splats.sh) @ _TO_YCOCG.T
+    values = {
+        "quats": _array(splats.quats)[:, 1:],
+        "log_scales": _array(splats.log_scales),
+        "opacities": _array(splats.logit_opacities.sigmoid())[:, None],
+        "sh_0": colours[:, 0],
+        "sh_rest": colours[:, 1:].reshape(len(colours), -1),
+    }
+    return [plain_part(name, values[name], steps[name]) for name in values if name in steps]
+
+
+def _bodies_parts(bodies: Bodies, first: Tensor, bound: float) -> list[Part]:
+    parts = [plain_part("points", _array(bodies.points), FIXED["points"] * bound)]
+    if bodies.log_radii is not None and bodies.body is None:
+        parts.append(plain_part("log_radii", _array(bodies.log_radii)[:, None], FIXED["log_radii"]))
+    if bodies.body is not None:
+        parts.append(plain_part("body", _array(bodies.body[first])[:, None], 1.0))
+    return parts
+
+
+def _track_parts(name: str, track: Track, step: float) -> list[Part]:
+    """Code a track's shares, and the curves of which any channel has a share left."""
+    step = float(short(np.array([step]))[0])
+    shares = _array(track.shares)
+    if name == COLOURS:
+        shares = _colours(shares, _TO_YCOCG)
+    # curves are of unit length: their values at a time are that much less
+    q = np.rint(shares / (step * np.sqrt(len(track.curves)))).astype(np.int64)
+    left = np.flatnonzero(q.any(axis=(0, 1)))
+    if not len(left):
+        return []
+    q = q[:, :, left]
+    curves = _array(track.curves)[:, left] * np.sqrt(len(track.curves))
+    # what rounding a curve adds to a channel is in proportion to the channel's share of it
+    shared = np.sqrt(np.square(q, dtype=np.float64).mean(axis=(0, 1)))
+    fine = FINER / np.maximum(shared, FINER)
+    return [
+        plain_part(CURVES + name, curves, fine),
+        signed_part(SHARES + name, q.reshape(len(q), -1), step),
+    ]
+
+
+def _colours(shares: Floats, matrix: Floats) -> Floats:
+    """Return shares (M, 3 K, R) with every three channels in other colours."""
+    colours = shares.reshape(len(shares), -1, 3, shares.shape[2])
+    turned: Floats = np.einsum("ij,nkjr->nkir", matrix, colours)
+    return turned.reshape(shares.shape)
+
+
+def described(baked: Baked) -> dict[str, Any]:
+    """Return what the header of a file says of the parts as a whole."""
+    bodies = baked.bodies
+    about = None
+    if bodies is not None:
+        about = {"count": len(bodies.points), "neighbours": bodies.neighbours}
+    return {
+        "splats": len(baked.splats),
+        "moving": baked.moving,
+        "sh_degree": baked.splats.sh_degree,
+        "times": baked.times,
+        "bodies": about,
+    }
+
+
+def decoded(header: Mapping[str, Any], parts: Mapping[str, Part]) -> Baked:
+    """Return what parts say.
+
+    Raises:
+        KeyError, TypeError, ValueError, OverflowError: they do not fit together.
+    """
+    count, moving = int(header["splats"]), int(header["moving"])
+    degree, times = int(header["sh_degree"]), int(header["times"])
+    if not 0 <= moving <= count or not 0 <= degree <= 3 or times < 1:
+        raise ValueError(f"{moving} of {count} splats that move, of degree {degree}")
+    read = _Reader(parts)
+    colours = read.table("sh_0", count, 3)
+    if degree:
+        rest = read.table("sh_rest", count, 3 * ((degree + 1) ** 2 - 1))
+        colours = np.concatenate([colours, rest], axis=1)
+    sh = colours.reshape(count, -1, 3) @ _TO_RGB.T
+    turned = read.table("quats", count, 3)
+    w = np.sqrt(np.clip(1 - np.square(turned).sum(axis=1, keepdims=True), 0, None))
+    opacities = read.table("opacities", count, 1)[:, 0].clip(UNSEEN, 1 - UNSEEN)
+    splats = Splats(
+        _tensor(places_of(read.part(MEANS, count, 1), moving)),
+        _tensor(np.concatenate([w, turned], axis=1)),
+        _tensor(read.table("log_scales", count, 3)),
+        _tensor(np.log(opacities) - np.log1p(-opacities)),
+        _tensor(sh),
+    )
+    lives = _tensor(read.table("lives", moving, 4)) if "lives" in parts else None
+    bodies = _bodies_of(header.get("bodies"), read, moving)
+    tracks = {}
+    for name, channels in {**OF_BODIES, **OF_SPLATS, COLOURS: 3 * (degree + 1) ** 2}.items():
+        if CURVES + name in parts:
+            rows = moving if name not in OF_BODIES else 0 if bodies is None else len(bodies.points)
+            tracks[name] = _track_of(name, read, rows, channels, times)
+    return Baked(splats, moving, times, bodies, tracks, lives)
+
+
+def _bodies_of(about: Any, read: _Reader, moving: int) -> Bodies | None:
+    if about is None:
+        return None
+    count, neighbours = int(about["count"]), int(about["neighbours"])
+    points = _tensor(read.table("points", count, 3))
+    if neighbours:
+        if not 1 <= neighbours <= count:
+            raise ValueError(f"{count} bodies for {neighbours} neighbours")
+        return Bodies(points, _tensor(read.table("log_radii", count, 1)[:, 0]), None, neighbours)
+    body = read.table("body", moving, 1)[:, 0]
+    if len(body) and not (body.min() >= 0 and body.max() < count):
+        raise ValueError(f"splats that follow other bodies than the {count} that there are")
+    return Bodies(points, None, torch.from_numpy(np.rint(body).astype(np.int64)), 0)
+
+
+def _track_of(name: str, read: _Reader, rows: int, channels: int, times: int) -> Track:
+    rank = read.parts[CURVES + name].columns
+    curves = read.table(CURVES + name, times, rank)
+    shares = read.table(SHARES + name, rows, rank * channels).reshape(rows, channels, rank)
+    if name == COLOURS:
+        shares = _colours(shares, _TO_RGB)
+    return Track(_tensor(curves), _tensor(shares))
+
+
+class _Reader:
+    """Parts by name, whose sizes are checked."""
+
+    def __init__(self, parts: Mapping[str, Part]) -> None:
+        self.parts = parts
+
+    def part(self, name: str, rows: int, columns: int) -> Part:
+        part = self.parts[name]
+        if (part.rows, part.columns) != (rows, columns):
+            found = f"{part.rows} x {part.columns}"
+            raise ValueError(f"part '{name}' is {found}, not {rows} x {columns}")
+        return part
+
+    def table(self, name: str, rows: int, columns: int) -> Floats:
+        values = values_of(self.part(name, rows, columns))
+        if not np.isfinite(values).all():
+            raise ValueError(f"part '{name}' holds values that are not finite")
+        return values
+
+
+def _array(tensor: Tensor) -> Floats:
+    return tensor.detach().double().numpy()
+
+
+def _tensor(values: Floats) -> Tensor:
+    return torch.from_numpy(np.ascontiguousarray(values, dtype=np.float32))
