@@ -13,15 +13,26 @@ from gsdmsr_cli.exports import Facts, RunFacts
 from gsdmsr_cli.exports._source import Source
 from gsdmsr_cli.ground.errors import DataError
 from gsdmsr_cli.ground.progress import OnProgress
+from gsdmsr_cli.options.strict import require
 from gsdmsr_cli.runs import checkpoints
-from gsdmsr_cli.runs.packing import pack
+from gsdmsr_cli.runs.packing import TOLERANCE, pack
 
 WHOLE = True
 
 
 @dataclass(frozen=True)
 class Options:
-    """None."""
+    """Settings.
+
+    Attributes:
+        tolerance: how far what is drawn may be off by the rounding of one tensor: of centres in
+            units of the splats' sizes, of rotations [rad], of log scales, opacities and colours.
+    """
+
+    tolerance: float = TOLERANCE
+
+    def __post_init__(self) -> None:
+        require(self, "tolerance", 0 <= self.tolerance <= 1, "0 to 1; less is nearer and larger")
 
 
 def lost(source: Source, options: Options) -> list[str]:
@@ -40,7 +51,7 @@ def write(
     """
     if out.exists() and not (out.is_dir() and not any(out.iterdir())):
         raise DataError(f"{out}: exists; --format compact writes a new run, choose another --out")
-    tensors, described = pack(source.model)
+    tensors, described = pack(source.model, options.tolerance)
     run = cast(RunFacts, facts)
     run.describe(out)
     path = checkpoints.save_packed(out, tensors, described, run.step, run.progress)

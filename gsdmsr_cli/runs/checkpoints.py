@@ -163,6 +163,7 @@ def read(path: Path) -> tuple[Checkpoint, int]:
 
     Raises:
         SafetensorError, OSError, WRONG: it is damaged or not there.
+        DataError: another version has packed it.
     """
     data = path.read_bytes()  # at once: a training may replace the file
     about = json.loads(_metadata(data)["gsdmsr"])
@@ -171,7 +172,7 @@ def read(path: Path) -> tuple[Checkpoint, int]:
     tensors, packed = load(data), None
     if "packed" in about:
         packed = {name: tensor.nbytes for name, tensor in tensors.items()}
-        tensors = unpack(tensors, about["packed"])
+        tensors = unpack(tensors, about["packed"], path)
     state = dict(about["state"])
     checkpoint = Checkpoint(step, progress, elapsed, tensors, state, *whose, packed)
     return checkpoint, int(about["schema"])

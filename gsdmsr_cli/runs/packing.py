@@ -1,20 +1,18 @@
 """Packs a model's tensors into few bytes and back (Compact 3DGS, Lee et al., arXiv 2408.03822).
 
 Splats that are never drawn are left out, the others put in Morton order. Rotations and scales are
-the codes of the layer ``quantise`` where there is one; positions and small tensors have 16 bits a
-value, all else 8 bits between the least and the largest value of its column. All is deflated.
+the codes of the layer ``quantise`` where there is one. All else has as few bits a value as leave
+what is drawn where it is, within a tolerance, and 16 where nobody can tell; all is compressed.
 """
 
 from __future__ import annotations
 
-import math
-import zlib
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from gsdmsr_cli.ground.errors import DataError
@@ -23,54 +21,72 @@ from gsdmsr_cli.model.layers.mask import Mask
 from gsdmsr_cli.model.layers.quantise import Quantise, decode
 from gsdmsr_cli.model.model import FURTHER, MOVING, STORED_AS, Model
 from gsdmsr_cli.model.parameter import Parameter
+from gsdmsr_cli.runs import packed_values
+from gsdmsr_cli.runs.tolerance import bits_of
 
-Array = NDArray[Any]
-Description = dict[str, dict[str, Any]]
-"""Of each tensor its "kind", its "shape" and the "type" of its values, plain JSON."""
+Description = dict[str, Any]
+"""The "layout" and how each of the "tensors" is written, see ``packed_values.encode``; JSON."""
 
-SMALL = 16384
-"""Values of a shared tensor up to which they have 16 bits each: most networks."""
+LAYOUT = 2
+"""Of what is packed. In 1 values had 8 bits between the ends of their column, or 16, deflated."""
 
-_LEVELS = 255
+TOLERANCE = 0.02
+"""How far what is drawn may be off by the rounding of one tensor, see ``tolerance.distance``."""
+
 _BOOKS = f"{FURTHER}quantise."
 
 
 @torch.no_grad()
-def pack(model: Model) -> tuple[dict[str, Tensor], Description]:
+def pack(model: Model, tolerance: float = TOLERANCE) -> tuple[dict[str, Tensor], Description]:
     """Return what the tensors of a model become, uint8 each, and what tells how to read them.
 
     The model is left with the splats that are packed, in their order.
 
+    Args:
+        model: what is packed.
+        tolerance: see ``tolerance.bits_of``.
+
     Raises:
         DataError: a value is not finite.
     """
+    _require_finite(model)
     rows = _in_order(model)
     model.take(rows, torch.zeros_like(rows, dtype=torch.bool))
     codes = _settle(model)
+    rounded = [p.name for p in model.parameters() if _is_trained(p) and p.name not in codes]
+    bits = bits_of(model, tolerance, rounded)
     packed: dict[str, Tensor] = {}
-    described: Description = {}
+    described: dict[str, dict[str, Any]] = {}
     for parameter in model.parameters():
         name, values = parameter.name, parameter.tensor.detach().cpu().numpy()
-        kind = "codes" if name in codes else _kind(parameter)
-        if not np.isfinite(values).all():
-            raise DataError(f"'{name}' holds values that are not finite; train again")
-        given = codes[name].cpu().numpy().astype(np.uint8) if name in codes else values
-        described[name] = {"kind": kind, "shape": list(given.shape), "type": str(given.dtype)}
-        packed[name] = _deflated(_ENCODED[kind](given))
+        kind = "steps" if name in bits else "half" if _is_trained(parameter) else "raw"
+        if name in codes:
+            kind, values = "codes", codes[name].cpu().numpy().astype(np.uint8)
+        packed[name], described[name] = packed_values.encode(values, kind, bits.get(name, 0))
     if model.moving < len(model.splats):
-        described[MOVING] = {"kind": "raw", "shape": [], "type": "int64"}
-        packed[MOVING] = _deflated(np.array(model.moving, np.int64).tobytes())
-    return packed, described
+        moving = np.array(model.moving, np.int64)
+        packed[MOVING], described[MOVING] = packed_values.encode(moving, "raw")
+    return packed, {"layout": LAYOUT, "tensors": described}
 
 
-def unpack(packed: Mapping[str, Tensor], described: Mapping[str, Any]) -> dict[str, Tensor]:
-    """Return the tensors that have been packed.
+def unpack(
+    packed: Mapping[str, Tensor], described: Mapping[str, Any], path: Path
+) -> dict[str, Tensor]:
+    """Return the tensors that have been packed, of a file that lies at ``path``.
 
     Raises:
         ValueError, LookupError, TypeError: they are not what the description says.
+        DataError: they are packed as another version does it.
     """
-    found = {name: _decoded(packed[name], about) for name, about in described.items()}
-    for name, about in described.items():
+    layout = described.get("layout", 1)
+    if layout != LAYOUT:
+        raise DataError(
+            f"{path}: is packed in layout {layout}, and this version reads {LAYOUT}; export it "
+            "again from the run that it was made of"
+        )
+    tensors = described["tensors"]
+    found = {name: packed_values.decode(packed[name], about) for name, about in tensors.items()}
+    for name, about in tensors.items():
         if about["kind"] == "codes":
             book = found[_BOOKS + name.removeprefix(STORED_AS)]
             if int(found[name].max(initial=0)) >= book.shape[1] or found[name].shape[1] > len(book):
@@ -103,8 +119,8 @@ def _in_order(model: Model) -> Tensor:
 def _settle(model: Model) -> dict[str, Tensor]:
     """Let layers need nothing that is not packed; return the codes of tensors that have them.
 
-    What is drawn stays the same: masks hide none of the splats that are left, rounded values need
-    not be rounded once more, and coefficients that a field takes the place of are not read.
+    What is drawn stays the same: masks hide none of the splats that are left, sums of codes stand
+    where they stood for values, and coefficients that a field takes the place of are not read.
     """
     codes: dict[str, Tensor] = {}
     for layer in model.layers.values():
@@ -115,85 +131,18 @@ def _settle(model: Model) -> dict[str, Tensor]:
         elif isinstance(layer, Quantise) and layer.fitted.any():
             own = layer.encode(model.splats)
             codes = {STORED_AS + name: chosen for name, chosen in own.items()}
+            for name, chosen in own.items():
+                getattr(model.splats, name).copy_(decode(chosen, layer.books[name]))
             layer.fitted.zero_()
+            layer.check()  # which now says that there is nothing to do
     return codes
 
 
-def _kind(parameter: Parameter) -> str:
-    tensor = parameter.tensor
-    if parameter.rate is None or not tensor.is_floating_point():
-        return "raw"
-    small = not parameter.per_splat and tensor.numel() <= SMALL
-    return "half" if small or parameter.name == f"{STORED_AS}means" else "bytes"
+def _is_trained(parameter: Parameter) -> bool:
+    return parameter.rate is not None and parameter.tensor.is_floating_point()
 
 
-def _halves(values: Array) -> bytes:
-    """Return 16 bits a value, column by column, all lower bytes before all higher ones."""
-    with np.errstate(over="ignore"):
-        columns = _columns(values).T.astype("<f2")
-    if not np.isfinite(columns).all():
-        raise DataError("a value is too large for 16 bits")
-    halves: bytes = np.frombuffer(columns.tobytes(), np.uint8).reshape(-1, 2).T.tobytes()
-    return halves
-
-
-def _levels(values: Array) -> bytes:
-    """Return the least value and the step of each column, then 8 bits a value by column."""
-    columns = _columns(values).astype("<f4")
-    ends = np.zeros((2, columns.shape[1]), "<f4")
-    if len(columns):
-        ends[0], ends[1] = columns.min(axis=0), np.ptp(columns, axis=0) / _LEVELS
-    places = np.round((columns - ends[0]) / np.where(ends[1] > 0, ends[1], 1)).clip(0, _LEVELS)
-    levels: bytes = places.astype(np.uint8).T.tobytes()
-    return ends.tobytes() + levels
-
-
-_ENCODED: dict[str, Callable[[Array], bytes]] = {
-    "half": _halves,
-    "bytes": _levels,
-    "codes": lambda values: values.T.tobytes(),
-    "raw": lambda values: values.tobytes(),
-}
-
-
-def _columns(values: Array) -> Array:
-    """Return an array as a table: its last axis are the columns, where it has two axes or more."""
-    return values.reshape(-1, values.shape[-1] if values.ndim > 1 and values.shape[-1] else 1)
-
-
-def _deflated(data: bytes) -> Tensor:
-    return torch.frombuffer(bytearray(zlib.compress(data, 9)), dtype=torch.uint8)
-
-
-def _inflated(data: Tensor, length: int) -> bytes:
-    """Return the bytes that were deflated; raise ValueError unless they are so many."""
-    inflater = zlib.decompressobj()
-    try:
-        found = inflater.decompress(data.numpy().tobytes(), length + 1)
-    except zlib.error as error:
-        raise ValueError(f"packed data is damaged: {error}") from error
-    if len(found) != length or not inflater.eof:
-        raise ValueError(f"packed data has not the {length} bytes that it should have")
-    return found
-
-
-def _decoded(data: Tensor, about: Mapping[str, Any]) -> Array:
-    """Return the values of a packed tensor; of codes, the codes."""
-    kind, shape, dtype = about["kind"], tuple(map(int, about["shape"])), np.dtype(about["type"])
-    if kind not in _ENCODED or min(shape, default=0) < 0:
-        raise ValueError(f"nothing is packed as '{kind}' of shape {shape}")
-    count = math.prod(shape)
-    if kind == "raw":
-        return np.frombuffer(_inflated(data, count * dtype.itemsize), dtype).reshape(shape).copy()
-    if kind == "codes":
-        codes = np.frombuffer(_inflated(data, count), np.uint8)
-        return codes.reshape(shape[::-1]).T.copy()
-    width = shape[-1] if len(shape) > 1 and shape[-1] else 1
-    if kind == "half":
-        parts = np.frombuffer(_inflated(data, 2 * count), np.uint8).reshape(2, -1)
-        columns = np.frombuffer(parts.T.tobytes(), "<f2").reshape(width, -1)
-        return columns.T.reshape(shape).astype(np.float32)
-    found = _inflated(data, 8 * width + count)
-    low, step = np.frombuffer(found[: 8 * width], "<f4").reshape(2, width)
-    places = np.frombuffer(found[8 * width :], np.uint8).reshape(width, -1).T
-    return (low + step * places).astype(np.float32).reshape(shape)
+def _require_finite(model: Model) -> None:
+    for name, tensor in model.tensors().items():
+        if not tensor.isfinite().all():
+            raise DataError(f"'{name}' holds values that are not finite; train again")

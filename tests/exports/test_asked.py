@@ -135,6 +135,6 @@ def test_a_run_in_few_bytes_is_the_run_and_takes_no_wishes(
     tmp_path: Path, wish: dict[str, Any]
 ) -> None:
     (name,) = wish
-    with pytest.raises(UsageError, match=f"{name} is not for --format compact, which takes no"):
+    with pytest.raises(UsageError, match=f"{name} is not for --format compact, which takes tol"):
         write("compact", usual_splats(3, 0), tmp_path / "run", **wish)
     assert not list(tmp_path.iterdir())

@@ -1,7 +1,8 @@
-"""Draws splats as a compact file stores them (Compact 3DGS, Lee et al., CVPR 2024, section 3.2).
+"""Draws rotations and scales as codes (Compact 3DGS, Lee et al., CVPR 2024, section 3.2).
 
-Rotations and scales are sums of codes from residual codebooks, positions have 16 bits a
-coordinate, opacities 8. Values that are trained pass gradients on as if they were drawn exactly.
+They are sums of codes from residual codebooks, as a compact file stores them. Values that are
+trained pass gradients on as if they were drawn exactly. What else such a file rounds
+(``runs.packing``) is rounded too finely to matter in training.
 """
 
 from __future__ import annotations
@@ -22,8 +23,6 @@ BOOKS = {"quats": 4, "log_scales": 3}
 
 _ROUNDS = 10
 """Of k-means for each stage of a codebook."""
-
-_LEVELS = 255
 
 
 @dataclass(frozen=True)
@@ -47,7 +46,7 @@ class Options:
 
 
 class Quantise(Layer):
-    """Residual vector quantisation of rotations and scales, rounding of positions and opacities."""
+    """Residual vector quantisation of rotations and scales."""
 
     concerns_still = True
     before_motion = True
@@ -66,19 +65,15 @@ class Quantise(Layer):
             self._active = bool(self.fitted.any())
 
     def at(self, moment: Moment, instant: Instant) -> Moment:
-        """Return the splats as they are stored; those given, before the codebooks are fitted."""
+        """Return the splats as codes have them; those given, before the codebooks are fitted."""
         if not self._active:
             return moment
-        splats = moment.splats
+        splats, codes = moment.splats, self.encode(moment.splats)
         stored = {
-            name: _straight(getattr(splats, name), decode(self.encode(splats)[name], book))
+            name: _straight(getattr(splats, name), decode(codes[name], book))
             for name, book in self.books.items()
         }
-        means = _straight(splats.means, splats.means.detach().half().float())
-        levels, low, step = opacity_levels(splats.logit_opacities)
-        opacities = _straight(splats.logit_opacities, low + step * levels)
-        changed = replace(splats, means=means, logit_opacities=opacities, **stored)
-        return replace(moment, splats=changed)
+        return replace(moment, splats=replace(splats, **stored))
 
     @torch.no_grad()
     def encode(self, splats: Splats) -> dict[str, Tensor]:
@@ -134,15 +129,6 @@ def decode(codes: Tensor, book: Tensor) -> Tensor:
     for stage, chosen in zip(own, codes.unbind(1), strict=True):
         total = total + stage[chosen]
     return total
-
-
-def opacity_levels(logits: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the 8 bits of each logit (N,), as floats, and the least one and the step between."""
-    own = logits.detach()
-    finite = own[own.isfinite()]
-    ends = torch.stack([finite.min(), finite.max()]) if len(finite) else own.new_zeros(2)
-    step = ((ends[1] - ends[0]) / _LEVELS).clamp(min=1e-9)
-    return ((own - ends[0]) / step).round().clamp(0, _LEVELS), ends[0], step
 
 
 def _straight(value: Tensor, stored: Tensor) -> Tensor:

@@ -1,0 +1,132 @@
+"""Tensors get the least bits that leave what is drawn where it is, within a tolerance."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from kernel_checks import generator
+from motion_checks import FACTS, disturbed, splats_of, started
+from torch import Tensor
+
+from gsdmsr_cli.gaussians.moment import Moment
+from gsdmsr_cli.gaussians.splats import Splats
+from gsdmsr_cli.model.building import load_model, start_model
+from gsdmsr_cli.model.layer import Layer
+from gsdmsr_cli.model.model import Model
+from gsdmsr_cli.runs.packed_values import rounded
+from gsdmsr_cli.runs.tolerance import MOMENTS, bits_of, distance
+
+COUNT = 60
+MOTION = {"name": "control_points", "count": 20, "levels": [8], "channels": 16, "width": 16}
+
+
+def model_of() -> Model:
+    model = start_model(splats_of(COUNT), MOTION, (), FACTS, generator())
+    disturbed(model.layers["motion"])
+    return model
+
+
+def drawn(model: Model) -> list[Moment]:
+    return [model.at(model.instant(i / (MOMENTS - 1))) for i in range(MOMENTS)]
+
+
+def distance_at(model: Model, name: str, bits: int) -> float:
+    """Return it by a model of its own, which cannot remember anything of other values."""
+    tensors = {key: tensor.detach().clone() for key, tensor in model.tensors().items()}
+    tensors[name] = torch.from_numpy(rounded(tensors[name].numpy(), bits))
+    with torch.no_grad():
+        return distance(drawn(model), drawn(load_model(tensors, MOTION, (), FACTS, 1.0)))
+
+
+@pytest.mark.parametrize("tolerance", [0.002, 0.03])
+def test_bits_are_the_least_that_keep_to_the_tolerance(tolerance: float) -> None:
+    model = model_of()
+    before = {name: tensor.detach().clone() for name, tensor in model.tensors().items()}
+    found = bits_of(model, tolerance, model.trained().keys())
+    assert all(torch.equal(tensor, before[name]) for name, tensor in model.tensors().items())
+    assert {"splats.means", "splats.sh", "motion.grid.0.space"} < found.keys()
+    assert len(set(found.values())) > 3
+    for name, bits in found.items():
+        assert distance_at(model, name, bits) <= tolerance, name
+        assert bits == 4 or distance_at(model, name, bits - 1) > tolerance, name
+
+
+def test_what_nothing_shows_of_and_what_16_bits_are_too_few_for_are_left_out() -> None:
+    """A network that makes colours after drawing; positions one of which is far away."""
+    splats = splats_of(COUNT)
+    splats.means[0] = 1e5
+    model = start_model(splats, {"name": "static"}, [{"name": "decoder"}], FACTS, generator())
+    disturbed(model.layers["layers.decoder"])
+    found = bits_of(model, 0.01, model.trained().keys())
+    assert not any(name.startswith("layers.decoder.network") for name in found)
+    assert "splats.means" not in found
+    assert {"splats.quats", "layers.decoder.directions"} < found.keys()
+
+
+def test_equal_values_and_none_at_all_take_the_least_bits() -> None:
+    model = model_of()
+    model.splats.sh.data.fill_(0.3)
+    assert bits_of(model, 0.0, ["splats.sh"]) == {"splats.sh": 4}
+
+
+def one(**changed: Tensor) -> list[Moment]:
+    """Return a splat of size 0.1 and opacity 1/2, with other values."""
+    splats = Splats(
+        means=torch.zeros(1, 3),
+        quats=torch.tensor([[2.0, 0, 0, 0]]),
+        log_scales=torch.full((1, 3), math.log(0.1)),
+        logit_opacities=torch.zeros(1),
+        sh=torch.zeros(1, 4, 3),
+    )
+    return [Moment(replace(splats, **changed))]
+
+
+@pytest.mark.parametrize(
+    ("changed", "expected"),
+    [
+        ({"means": torch.tensor([[0.0, 0.01, 0.0]])}, 0.1),
+        ({"means": torch.tensor([[0.0, 9.0, 0.0]])}, 1.0),
+        ({"quats": torch.tensor([[math.cos(0.05), math.sin(0.05), 0, 0]])}, 0.1),
+        ({"log_scales": torch.full((1, 3), math.log(0.1) + 0.2)}, 0.2 * 3**0.5),
+        ({"logit_opacities": torch.tensor([math.log(3)])}, 0.25),
+        ({"sh": torch.tensor([[[1.0, 0, 0]] + [[0.0, 0, 0]] * 3])}, 0.28209479),
+    ],
+    ids=lambda each: next(iter(each)) if isinstance(each, dict) else str(each),
+)
+def test_distances_are_in_units_of_what_is_seen(
+    changed: dict[str, Tensor], expected: float
+) -> None:
+    assert distance(one(), one(**changed)) == pytest.approx(expected, rel=1e-3)
+    assert distance(one(), one()) == 0
+
+
+def test_axes_and_features_count_where_there_are_such() -> None:
+    (bare,) = one()
+    axes, features = 0.1 * torch.eye(3)[None], torch.zeros(1, 2)
+    exact = replace(bare, axes=axes, features=features)
+    assert distance([exact], [replace(exact, axes=1.1 * axes)]) == pytest.approx(0.1 * 3**0.5)
+    assert distance([exact], [replace(exact, features=features + 0.3)]) == pytest.approx(
+        0.3 * 2**0.5
+    )
+
+
+def test_a_splat_counts_by_its_opacity_and_size() -> None:
+    splats = splats_of(2)
+    splats.log_scales[:] = torch.tensor([[-2.0], [-3.0]])
+    splats.logit_opacities[:] = torch.tensor([0.0, 2.0])
+    weights = torch.tensor([math.exp(-2) * 0.5, math.exp(-3) / (1 + math.exp(-2))])
+    for row in (0, 1):
+        other = splats.map(torch.clone)
+        other.log_scales[row, 0] += 0.1
+        expected = 0.1 * math.sqrt(weights[row] / weights.sum())
+        assert distance([Moment(splats)], [Moment(other)]) == pytest.approx(expected, rel=1e-4)
+
+
+def test_a_layer_that_wants_a_camera_gets_one() -> None:
+    layer: Layer = disturbed(started("static", COUNT))
+    layer.needs_camera = True  # type: ignore[misc]
+    model = Model(splats_of(COUNT), {"motion": layer})
+    assert "splats.means" in bits_of(model, 0.02, ["splats.means"])
