@@ -10,6 +10,7 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -19,7 +20,11 @@ from gsdmsr_cli.ops import displace as deformation
 from gsdmsr_cli.ops import hash_grid, network, planes, precision
 from gsdmsr_cli.ops import skin as skinning
 from gsdmsr_cli.ops.adam.cuda import Row, adam
+from gsdmsr_cli.ops.cube_map import show_behind
 from gsdmsr_cli.ops.nearest import nearest_points
+from gsdmsr_cli.ops.series import add_series
+from gsdmsr_cli.ops.slices import slices
+from gsdmsr_cli.scene.camera import Camera
 
 Values = dict[str, Tensor]
 
@@ -167,6 +172,34 @@ def _displace(device: str, dtype: torch.dtype) -> Values:
     return _with_gradients(moved, names, [*stored, offsets, shift])
 
 
+def _add_series(device: str, dtype: torch.dtype) -> Values:
+    """Add three of five coefficients of three columns to the first of four."""
+    shapes = (_COUNT, 4), (_COUNT, 5, 3), (_COUNT, 3)
+    given = (_random(*shape, seed=seed) for seed, shape in enumerate(shapes))
+    start, coefficients, basis = leaves = _leaves(device, dtype, *given)
+    added = add_series(start, coefficients, basis, 1.3, 1)
+    return _with_gradients(added, ("starts", "coefficients", "bases"), leaves)
+
+
+def _slice(device: str, dtype: torch.dtype) -> Values:
+    quats, log_scales, tilts = (_random(_COUNT, width, seed=width) for width in (4, 3, 4))
+    leaves = _leaves(device, dtype, quats, log_scales, 1 + tilts, _random(_COUNT, seed=1))
+    cut = slices(*leaves)
+    side_by_side = [cut.variances[:, None], cut.velocities, cut.axes.flatten(1)]
+    names = ("quaternions", "log scales", "tilts", "log durations")
+    return _with_gradients(torch.cat(side_by_side, dim=1), names, leaves)
+
+
+def _show_behind(device: str, dtype: torch.dtype) -> Values:
+    """Show what lies behind a picture through five faces of a cube."""
+    camera = Camera(np.eye(4), 5.0, 6.0, 9.0, 8.0, 18, 16)
+    points = torch.arange(96).view(6, 4, 4)
+    given = _random(16, 18, 3), _random(16, 18, seed=1).sigmoid(), _random(96, 3, seed=2)
+    rgb, alpha, colours = leaves = _leaves(device, dtype, *given)
+    shown = show_behind(rgb, alpha, colours, points.to(device), camera)
+    return _with_gradients(shown, ("pictures", "alpha", "colours"), leaves)
+
+
 def _apply_network(device: str, dtype: torch.dtype) -> Values:
     widths = [(48, 64), (64, 32), (32, 10)]
     tensors = [
@@ -219,6 +252,9 @@ OPERATIONS = {
     "the transforms of control points": _Operation(_transform, FLOAT32),
     "skinning splats": _Operation(_skin, FLOAT32),
     "displacing splats": _Operation(_displace, FLOAT32),
+    "adding series": _Operation(_add_series, FLOAT32),
+    "slices of Gaussians in time": _Operation(_slice, FLOAT32),
+    "colours behind splats": _Operation(_show_behind, FLOAT32),
     "a network": _Operation(_apply_network, FLOAT32),
     # gradients are bfloat16 in either format, and some units near 0 are cut off on the other side
     **{

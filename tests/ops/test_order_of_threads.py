@@ -20,9 +20,12 @@ from gsdmsr_cli.gaussians.moment import Moment
 from gsdmsr_cli.gaussians.splats import Splats
 from gsdmsr_cli.ops import hash_grid, planes
 from gsdmsr_cli.ops import skin as skinning
+from gsdmsr_cli.ops.cube_map import show_behind
 from gsdmsr_cli.ops.hash_grid import cuda as hashed
 from gsdmsr_cli.ops.nearest import nearest_points
 from gsdmsr_cli.ops.planes import cuda as grids
+from gsdmsr_cli.ops.series import add_series
+from gsdmsr_cli.ops.slices import slices
 from gsdmsr_cli.raster import cuda
 
 SIZE = 40
@@ -100,6 +103,29 @@ def looking_up_hashed() -> list[Tensor]:
     return [features, *torch.autograd.grad(features.square().sum(), [table, points])]
 
 
+def adding_series() -> list[Tensor]:
+    rng = generator(2)
+    own = [torch.randn(300, *s, generator=rng).requires_grad_() for s in ((4,), (5, 3), (3,))]
+    found = add_series(*own, 1.3, 1)
+    return [found, *torch.autograd.grad(found[40:].square().sum(), own)]
+
+
+def slicing() -> list[Tensor]:
+    rng = generator(2)
+    own = [torch.randn(300, *s, generator=rng).requires_grad_() for s in ((4,), (3,), (4,), ())]
+    cut = slices(*own)
+    total = sum(part[40:].square().sum() for part in (cut.velocities, cut.axes))
+    return [*cut, *torch.autograd.grad(total, own)]
+
+
+def showing_behind() -> list[Tensor]:
+    rng = generator(2)
+    own = [torch.rand(s, generator=rng).requires_grad_() for s in ((SIZE, SIZE, 3), (SIZE, SIZE))]
+    own.append(torch.rand(96, 3, generator=rng).requires_grad_())
+    found = show_behind(*own, torch.arange(96).view(6, 4, 4), camera(SIZE))
+    return [found, *torch.autograd.grad(found.square().sum(), own)]
+
+
 def following() -> list[Tensor]:
     """Splats that follow control points, of which some are given no gradient."""
     splats, (points, log_radii, deformation) = splats_of(150), control_points_of(45)
@@ -123,6 +149,9 @@ WORKS: dict[str, Callable[[], list[Tensor]]] = {
     "control_points": following,
     "plane grids": lambda: looking_up(torch.float32),
     "hash grids": looking_up_hashed,
+    "series": adding_series,
+    "slices": slicing,
+    "cube map": showing_behind,
     "plane grids in bf16": lambda: looking_up(torch.bfloat16),
     "plane grids in fp16": lambda: looking_up(torch.float16),
 }

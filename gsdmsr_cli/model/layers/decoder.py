@@ -94,21 +94,22 @@ class Decoder(Layer):
             return frame
         if instant.camera is None:
             raise ValueError("colours that depend on the line of sight need a camera")
-        sights = self._sights(instant.camera, frame.rgb)
-        seen = torch.cat([frame.rgb, frame.features, frame.alpha[..., None], sights], dim=2)
-        added = network.apply_network(self.layers, seen.view(-1, INPUTS)).view(frame.rgb.shape)
-        return replace(frame, rgb=frame.rgb + frame.alpha[..., None] * added)
+        rgb, pixels = _planes(frame.rgb), _covered(frame.alpha)
+        planes = torch.cat([rgb, _planes(frame.features), frame.alpha.reshape(1, -1)])
+        shown = planes.gather(1, pixels.expand(len(planes), -1))
+        seen = torch.cat([shown, self._sights(instant.camera, pixels).to(rgb)])
+        added = network.apply_network(self.layers, seen.T).T
+        found = rgb.scatter_add(1, pixels.expand(3, -1), shown[-1] * added)
+        return replace(frame, rgb=found.T.view(frame.rgb.shape))
 
-    def _sights(self, camera: Camera, like: Tensor) -> Tensor:
-        """Return where each pixel is seen from [bounds] and in which direction, (H, W, 6)."""
-        height, width = camera.height, camera.width
-        across = (torch.arange(width).to(like) + 0.5 - camera.cx) / camera.fx
-        down = (torch.arange(height).to(like) + 0.5 - camera.cy) / camera.fy
-        right, below, ahead = torch.from_numpy(camera.rotation).to(like)
-        lines = across[:, None] * right + (down[:, None, None] * below + ahead)
-        lines = torch.nn.functional.normalize(lines, dim=2)
-        centre = torch.from_numpy(camera.centre / self.bound).to(like)
-        return torch.cat([centre.expand(height, width, 3), lines], dim=2)
+    def _sights(self, camera: Camera, pixels: Tensor) -> Tensor:
+        """Return where pixels (M,), by number, are seen from [bounds] and whereto, (6, M)."""
+        x = (pixels % camera.width + 0.5 - camera.cx) / camera.fx
+        y = (pixels // camera.width + 0.5 - camera.cy) / camera.fy
+        spots = torch.stack([x, y, torch.ones_like(x)]) / torch.sqrt(x * x + y * y + 1)
+        lines = torch.from_numpy(camera.rotation.T).to(spots) @ spots
+        centre = torch.from_numpy(camera.centre / self.bound).to(lines)
+        return torch.cat([centre[:, None].expand(3, len(pixels)), lines])
 
     def begin_at(self, times: Tensor) -> None:
         """Let features of time be about the times at which splats were seen."""
@@ -117,6 +118,18 @@ class Decoder(Layer):
     def check(self) -> None:
         """Raise ValueError unless the network fits."""
         network.check_network(self.layers, INPUTS, 3)
+
+
+def _planes(picture: Tensor) -> Tensor:
+    """Return (H, W, C) as (C, H W), which is how engines lay pictures out."""
+    return picture.permute(2, 0, 1).flatten(1)
+
+
+def _covered(alpha: Tensor) -> Tensor:
+    """Return the numbers (M,) of the pixels that show anything; all on a GPU, which would wait."""
+    if alpha.is_cpu:
+        return alpha.flatten().nonzero().flatten()
+    return torch.arange(alpha.numel(), device=alpha.device)
 
 
 def start(options: Options, facts: Facts, splats: Splats, generator: torch.Generator) -> Decoder:

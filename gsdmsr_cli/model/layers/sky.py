@@ -10,18 +10,15 @@ from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
-from torch.nn.functional import grid_sample
 
 from gsdmsr_cli.gaussians.frame import Frame
 from gsdmsr_cli.gaussians.moment import Moment
 from gsdmsr_cli.gaussians.splats import Splats
 from gsdmsr_cli.model.layer import Facts, Instant, Layer
 from gsdmsr_cli.model.parameter import Parameter
+from gsdmsr_cli.ops.cube_map import look, show_behind
+from gsdmsr_cli.ops.cube_map.twin import BESIDE
 from gsdmsr_cli.options.strict import require, require_rates
-from gsdmsr_cli.scene.camera import Camera
-
-BESIDE = ((1, 2), (2, 0), (0, 1))
-"""Of each axis the two others, which span the faces that it goes through."""
 
 
 @dataclass(frozen=True)
@@ -63,20 +60,16 @@ class Sky(Layer):
     def shade(self, frame: Frame, instant: Instant) -> Frame:
         """Return the frame with the sky behind it."""
         assert instant.camera is not None, "a layer that needs a camera is given one"
-        ways = directions(instant.camera).to(frame.rgb)
-        behind = (1 - frame.alpha)[..., None] * self.look(ways)
-        return replace(frame, rgb=frame.rgb + behind)
+        given = frame.rgb, frame.alpha, self.colours, self._places()
+        return replace(frame, rgb=show_behind(*given, instant.camera))
 
     def look(self, ways: Tensor) -> Tensor:
         """Return the colours in directions (..., 3) of any length but 0, linear between points."""
-        size = self._points.shape[1]
-        face, u, v = faces(ways)
-        row = (u + 1) / 2 * (size - 1) + size * face
-        places = torch.stack([v, 2 * row / (6 * size - 1) - 1], dim=-1)
+        return look(ways, self.colours, self._places())
+
+    def _places(self) -> Tensor:
         self._points = self._points.to(self.colours.device)
-        atlas = self.colours[self._points].flatten(0, 1).permute(2, 0, 1)  # faces in one column
-        found = grid_sample(atlas[None], places.view(1, 1, -1, 2).to(atlas), align_corners=True)
-        return found[0, :, 0].T.view(ways.shape)
+        return self._points
 
     def check(self) -> None:
         """Raise ValueError unless the colours are those of the points of a cube."""
@@ -104,23 +97,6 @@ def grid_points(size: int) -> Tensor:
     numbers = torch.stack(places) @ torch.tensor([size * size, size, 1])
     points: Tensor = torch.unique(numbers, return_inverse=True)[1]
     return points
-
-
-def faces(ways: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return which of the six faces directions (..., 3) go through, and where: -1 to 1, twice."""
-    reach, axis = ways.abs().max(dim=-1, keepdim=True)
-    beside = torch.tensor(BESIDE, device=ways.device)[axis[..., 0]]
-    u, v = (ways.gather(-1, beside) / reach).unbind(dim=-1)
-    ahead = ways.gather(-1, axis)[..., 0] > 0
-    return 2 * axis[..., 0] + ahead, u, v
-
-
-def directions(camera: Camera) -> Tensor:
-    """Return where the pixels of a camera look to in the world, (H, W, 3) float32, not unit."""
-    x = (torch.arange(camera.width) + 0.5 - camera.cx) / camera.fx
-    y = (torch.arange(camera.height) + 0.5 - camera.cy) / camera.fy
-    right, down, ahead = torch.from_numpy(camera.rotation).float().unbind(dim=0)
-    return x[None, :, None] * right + y[:, None, None] * down + ahead
 
 
 def start(options: Options, facts: Facts, splats: Splats, generator: torch.Generator) -> Sky:

@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -22,15 +21,12 @@ from torch import Tensor
 from gsdmsr_cli.gaussians.fading import fade
 from gsdmsr_cli.gaussians.moment import Moment
 from gsdmsr_cli.gaussians.splats import Splats
-from gsdmsr_cli.ground.geometry import scaled_axes
 from gsdmsr_cli.model.layer import Facts, Instant, Layer
-from gsdmsr_cli.model.motion._quaternions import left_products, right_products
 from gsdmsr_cli.model.parameter import Parameter
 from gsdmsr_cli.model.times import spread_times, take_known
+from gsdmsr_cli.ops.series import add_series
+from gsdmsr_cli.ops.slices import Slices, slices
 from gsdmsr_cli.options.strict import require, require_rates
-
-LEAST_VARIANCE = 1e-12
-"""Variances in time count as this at least."""
 
 
 @dataclass(frozen=True)
@@ -61,20 +57,6 @@ class Options:
         require_rates(self, "time_rate", "duration_rate", "tilt_rate")
 
 
-class Slices(NamedTuple):
-    """What slices of N Gaussians have at all times.
-
-    Attributes:
-        variances: (N,) S_tt.
-        velocities: (N, 3) S_xt / S_tt [world units / duration of the capture].
-        axes: (N, 3, 3) A with A A^T = S_xx - S_xt S_tx / S_tt [world units].
-    """
-
-    variances: Tensor
-    velocities: Tensor
-    axes: Tensor
-
-
 class Covariance4D(Layer):
     """Means (N,) and logarithms of durations (N,) in time, tilts (N, 4), and colours in time."""
 
@@ -101,38 +83,26 @@ class Covariance4D(Layer):
     def at(self, moment: Moment, instant: Instant) -> Moment:
         """Return the slices of the Gaussians at a time."""
         splats, since = moment.splats, instant.time - self.times
-        slices = self._slices(splats, slice(None))
-        exponents = since.square() / (2 * slices.variances)
+        cut = self._slices(splats, slice(None))
+        exponents = since.square() / (2 * cut.variances)
         drawn = replace(
             splats,
-            means=splats.means + since[:, None] * slices.velocities,
+            means=splats.means + since[:, None] * cut.velocities,
             logit_opacities=fade(splats.logit_opacities, exponents),
-            sh=splats.sh if self.sh is None else splats.sh + self._colours(since, self.sh),
+            sh=splats.sh if self.sh is None else self._colours(splats.sh, since, self.sh),
         )
-        return replace(moment, splats=drawn, axes=slices.axes)
+        return replace(moment, splats=drawn, axes=cut.axes)
 
     def _slices(self, splats: Splats, rows: Tensor | slice) -> Slices:
-        """Slice the Gaussians of some rows, which ``splats`` are.
+        """Slice the Gaussians of some rows, which ``splats`` are."""
+        own = self.tilts[rows], self.log_durations[rows]
+        return slices(splats.quats, splats.log_scales, *own)
 
-        S is M M^T. With m the row of M that is time and U an orthonormal basis of what is
-        perpendicular to it, A is the other three rows times U: for a unit quaternion m, that
-        basis is m i, m j and m k.
-        """
-        tilt = right_products(torch.nn.functional.normalize(self.tilts[rows], dim=1))
-        in_time = tilt[:, :, :1] * self.log_durations[rows].exp()[:, None, None]
-        spatial = tilt[:, :, 1:] @ scaled_axes(splats.quats, splats.log_scales)
-        time, space = torch.cat([in_time, spatial], dim=2).split([1, 3], dim=1)
-        variances = time.square().sum(dim=(1, 2)).clamp(min=LEAST_VARIANCE)
-        velocities = (space @ time.mT)[:, :, 0] / variances[:, None]
-        across = left_products(time[:, 0] / variances.sqrt()[:, None])[:, :, 1:]
-        return Slices(variances, velocities, space @ across)
-
-    def _colours(self, since: Tensor, sh: Tensor) -> Tensor:
-        """Return the sum over n of coefficients (N, n, K, 3) times cos(2 pi n (t - mu))."""
+    def _colours(self, before: Tensor, since: Tensor, sh: Tensor) -> Tensor:
+        """Add to ``before`` (N, K, 3) the sum over n of sh (N, n, K, 3) cos(2 pi n (t - mu))."""
         order = torch.arange(1, sh.shape[1] + 1, device=sh.device)
         waves = torch.cos(2 * math.pi * since[:, None] * order)
-        summed = waves[:, None] @ sh.flatten(2)
-        return summed.view(len(sh), *sh.shape[2:])
+        return add_series(before.flatten(1), sh.flatten(2), waves).view(before.shape)
 
     def lives(self, splats: Splats) -> Tensor:
         """Return lives about the times of the means, as long as the marginals."""
@@ -156,11 +126,11 @@ class Covariance4D(Layer):
         the Gaussian in space and time.
         """
         rows = children.nonzero().flatten()
-        slices = self._slices(splats.take(rows), rows)
-        noise = torch.randn(len(rows), generator=generator).to(slices.variances)
-        later = noise * slices.variances.sqrt()
+        cut = self._slices(splats.take(rows), rows)
+        noise = torch.randn(len(rows), generator=generator).to(cut.variances)
+        later = noise * cut.variances.sqrt()
         self.times[rows] += later
-        splats.means[rows] += later[:, None] * slices.velocities
+        splats.means[rows] += later[:, None] * cut.velocities
         self.log_durations[rows] -= math.log(shrink)
 
 

@@ -12,12 +12,12 @@ import math
 from dataclasses import dataclass, replace
 
 import torch
-from torch import Tensor
 
 from gsdmsr_cli.gaussians.moment import Moment
 from gsdmsr_cli.gaussians.splats import Splats
 from gsdmsr_cli.model.layer import Facts, Instant, Layer
 from gsdmsr_cli.model.parameter import Parameter
+from gsdmsr_cli.ops.series import add_series
 from gsdmsr_cli.options.strict import require
 
 MOST = 8
@@ -57,15 +57,15 @@ class Fourier(Layer):
 
     def at(self, moment: Moment, instant: Instant) -> Moment:
         """Return the moved and turned splats."""
-        splats, basis = moment.splats, self._basis(instant.time)
-        means = splats.means + (basis[:, None] * self.waves).sum(dim=1)
+        splats = moment.splats
+        means = add_series(splats.means, self.waves, self._basis(instant.time))
         quats = splats.quats + instant.time * self.turns
         return replace(moment, splats=replace(splats, means=means, quats=quats))
 
-    def _basis(self, time: float) -> Tensor:
-        """Return sine and cosine of every frequency in turn, (2 L,)."""
+    def _basis(self, time: float) -> list[float]:
+        """Return sine and cosine of every frequency in turn, 2 L numbers."""
         phases = [2.0**i * math.pi * time for i in range(self.waves.shape[1] // 2)]
-        return self.waves.new_tensor([wave(p) for p in phases for wave in (math.sin, math.cos)])
+        return [wave(p) for p in phases for wave in (math.sin, math.cos)]
 
     def check(self) -> None:
         """Raise ValueError unless the waves are pairs of three coordinates, and turns of four."""

@@ -22,6 +22,7 @@ from gsdmsr_cli.gaussians.splats import Splats
 from gsdmsr_cli.ground.geometry import quat_product
 from gsdmsr_cli.model.layer import Facts, Instant, Layer
 from gsdmsr_cli.model.parameter import Parameter
+from gsdmsr_cli.ops.series import add_series
 from gsdmsr_cli.options.strict import require, require_rates
 
 LARGEST_COSINE = 1 - 1e-4
@@ -81,12 +82,11 @@ class KeyframeMotion(Layer):
         intervals = self.turns.shape[1] - 1
         place = min(max(instant.time, 0.0), 1.0) * intervals
         before = min(int(place), intervals - 1)
-        weights = self.offsets.new_tensor(hermite(place - before))
-        offset = (self.offsets[:, before : before + 4] * weights[:, None]).sum(dim=1)
+        weights = hermite(place - before)
         turn = slerp(self.turns[:, before], self.turns[:, before + 1], place - before)
         splats = replace(
             moment.splats,
-            means=moment.splats.means + self.bound * offset,
+            means=add_series(moment.splats.means, self.offsets, weights, self.bound, before),
             quats=quat_product(turn, moment.splats.quats),
         )
         return replace(moment, splats=splats)

@@ -22,6 +22,7 @@ from gsdmsr_cli.gaussians.splats import Splats
 from gsdmsr_cli.model.layer import Facts, Instant, Layer
 from gsdmsr_cli.model.parameter import Parameter
 from gsdmsr_cli.model.times import spread_times, take_known
+from gsdmsr_cli.ops.series import add_series
 from gsdmsr_cli.options.strict import require, require_rates
 
 MOST = 16
@@ -73,14 +74,14 @@ class PolynomialMotion(Layer):
 
     def at(self, moment: Moment, instant: Instant) -> Moment:
         """Return the moved and turned splats."""
+        splats, basis = moment.splats, self._basis(instant.time)
         since = (instant.time - self.centres)[:, None]
-        way = (self.coefficients * self._basis(instant.time)[:, :, None]).sum(dim=1)
-        splats = replace(
-            moment.splats,
-            means=moment.splats.means + self.bound * way,
-            quats=moment.splats.quats + since * self.turns,
+        moved = replace(
+            splats,
+            means=add_series(splats.means, self.coefficients, basis, self.bound),
+            quats=splats.quats + since * self.turns,
         )
-        return replace(moment, splats=splats)
+        return replace(moment, splats=moved)
 
     def _basis(self, time: float) -> Tensor:
         """Return how far each polynomial has gone since the centres, (N, degree)."""

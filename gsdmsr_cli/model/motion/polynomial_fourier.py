@@ -21,6 +21,7 @@ from gsdmsr_cli.model.layer import Facts, Instant, Layer
 from gsdmsr_cli.model.motion._rigidity import rigidity
 from gsdmsr_cli.model.parameter import Parameter
 from gsdmsr_cli.ops.nearest import nearest_points
+from gsdmsr_cli.ops.series import add_series
 from gsdmsr_cli.options.strict import require, require_rates
 
 ROWS, NEIGHBOURS = 1024, 8
@@ -93,12 +94,12 @@ class DualDomain(Layer):
         sh = splats.sh
         if self.colours is not None:
             own = time_basis(times, o.colour_degree, o.colour_harmonics, o.period)
-            sh = torch.cat([sh[:, :1] + own[:, None] @ self.colours, sh[:, 1:]], dim=1)
+            sh = add_series(sh.flatten(1), self.colours, own).view(sh.shape)
         moved = replace(
             splats,
-            means=splats.means + self.facts.bound * sum_terms(basis, self.means),
-            quats=splats.quats + sum_terms(basis, self.quats),
-            log_scales=splats.log_scales + sum_terms(basis, self.log_scales),
+            means=add_series(splats.means, self.means, basis, self.facts.bound),
+            quats=add_series(splats.quats, self.quats, basis),
+            log_scales=add_series(splats.log_scales, self.log_scales, basis),
             sh=sh,
         )
         return replace(moment, splats=moved)
@@ -132,7 +133,9 @@ class DualDomain(Layer):
         """Return what is added to means [bounds] and quats of some splats, (M, 7)."""
         o = self.options
         basis = time_basis(self._own_times(time)[rows], o.degree, o.harmonics, o.period)
-        return torch.cat([sum_terms(basis, c[rows]) for c in (self.means, self.quats)], dim=1)
+        nothing = [self.means.new_zeros(len(rows), width) for width in (3, 4)]
+        own = zip(nothing, (self.means, self.quats), strict=True)
+        return torch.cat([add_series(zero, c[rows], basis) for zero, c in own], dim=1)
 
     def _deviation(self, splats: Splats, offsets: Tensor) -> Tensor:
         """Return how far splats are from taking each other along as rigid bodies would."""
@@ -159,11 +162,6 @@ def time_basis(times: Tensor, degree: int, harmonics: int, period: float) -> Ten
         angles = times[:, None] * frequencies.to(times)
         columns += [angles.sin(), angles.cos()]
     return torch.cat(columns, dim=1)
-
-
-def sum_terms(basis: Tensor, coefficients: Tensor) -> Tensor:
-    """Return the sum of terms (N, K) times coefficients (N, K, C), which is (N, C)."""
-    return (basis[:, None] @ coefficients)[:, 0]
 
 
 def start(options: Options, facts: Facts, splats: Splats, generator: torch.Generator) -> DualDomain:

@@ -16,7 +16,8 @@ from gsdmsr_cli.gaussians.moment import Moment
 from gsdmsr_cli.ground.errors import UsageError
 from gsdmsr_cli.model import layers
 from gsdmsr_cli.model.layer import Instant, start_layer
-from gsdmsr_cli.model.layers.sky import Sky, directions, grid_points
+from gsdmsr_cli.model.layers.sky import Sky, grid_points
+from gsdmsr_cli.ops.cube_map import directions
 from gsdmsr_cli.scene.camera import Camera, look_at
 
 CAMERA = Camera(
@@ -79,7 +80,7 @@ def test_a_sky_is_seen_as_much_as_splats_let_through() -> None:
     rgb, alpha = torch.rand(6, 8, 3), torch.rand(6, 8)
     frame = Frame(rgb, alpha, None, torch.zeros(1), torch.zeros(1, 2))
     found = sky.shade(frame, Instant(0.3, CAMERA)).rgb
-    expected = rgb + (1 - alpha)[..., None] * (on_cube(directions(CAMERA)) @ matrix)
+    expected = rgb + (1 - alpha)[..., None] * (on_cube(directions(CAMERA).float()) @ matrix)
     torch.testing.assert_close(found, expected, atol=1e-4, rtol=1e-4)
     moment = Moment(splats_of(3))
     assert sky.at(moment, Instant(0.3, CAMERA)) is moment
