@@ -20,6 +20,7 @@ PATIENCE = 60.0
 OPTIONS = (
     "--headless=new", "--no-sandbox", "--disable-gpu", "--hide-scrollbars", "--no-first-run",
     "--disable-dev-shm-usage", "--disable-background-networking", "--remote-debugging-pipe",
+    "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist",
 )  # fmt: skip
 
 
@@ -94,7 +95,7 @@ class Chromium:
         message, self._rest = self._rest.split(b"\0", 1)
         return dict(json.loads(message))
 
-    def open(self, path: Path, width: int, scheme: str = "light") -> None:
+    def open(self, path: Path, width: int, scheme: str = "light", fragment: str = "") -> None:
         """Show a file on a screen of a width [px], "light" or "dark"; return when it is there."""
         self.call(
             "Emulation.setDeviceMetricsOverride",
@@ -104,13 +105,16 @@ class Chromium:
         feature = {"name": "prefers-color-scheme", "value": scheme}
         self.call("Emulation.setEmulatedMedia", features=[feature])
         self.events.clear()
-        self.call("Page.navigate", url=path.as_uri())
+        anew = f"?{self._number}{fragment}" if fragment else ""  # a fragment alone loads nothing
+        self.call("Page.navigate", url=path.as_uri() + anew)
         while not any(event.get("method") == "Page.loadEventFired" for event in self.events):
             self.events.append(self._receive())
 
     def evaluate(self, expression: str) -> Any:
-        """Return the value of an expression of JavaScript."""
-        answer = self.call("Runtime.evaluate", expression=expression, returnByValue=True)
+        """Return the value of an expression of JavaScript, or what it promises."""
+        answer = self.call(
+            "Runtime.evaluate", expression=expression, returnByValue=True, awaitPromise=True
+        )
         assert "exceptionDetails" not in answer, answer
         return answer["result"].get("value")
 

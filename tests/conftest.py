@@ -10,6 +10,7 @@ from pathlib import Path
 
 import cuda_shim
 import pytest
+from chromium import VARIABLE, Chromium, find_chromium
 from datasets import write_picture
 
 from gsdmsr_cli.backends.cuda import availability
@@ -77,3 +78,17 @@ def kernels_on_the_cpu(_shim_folder: Path) -> Iterator[cuda_shim.Shim]:
         pytest.skip(cuda_shim.MISSING)
     with cuda_shim.on_the_cpu(_shim_folder) as shim:
         yield shim
+
+
+@pytest.fixture(scope="session")
+def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Chromium]:
+    """A browser without a screen, which draws WebGL on the CPU."""
+    binary = find_chromium()
+    if binary is None:
+        pytest.skip(f"no Chromium on the path; {VARIABLE} may name one")
+    try:
+        chromium = Chromium(binary, tmp_path_factory.mktemp("profile"))
+    except OSError as error:
+        pytest.skip(f"{binary} does not start: {error}")
+    with chromium:
+        yield chromium

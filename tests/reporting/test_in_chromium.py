@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
-from chromium import VARIABLE, Chromium, find_chromium
+from chromium import Chromium
 from report_pages import write_page
 
 NARROW, WIDE = 390, 1440
@@ -17,19 +16,6 @@ NARROW, WIDE = 390, 1440
 @pytest.fixture(scope="module")
 def report(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_page(tmp_path_factory.mktemp("report") / "report.html")
-
-
-@pytest.fixture(scope="module")
-def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Chromium]:
-    binary = find_chromium()
-    if binary is None:
-        pytest.skip(f"no Chromium on the path; {VARIABLE} may name one")
-    try:
-        chromium = Chromium(binary, tmp_path_factory.mktemp("profile"))
-    except OSError as error:
-        pytest.skip(f"{binary} does not start: {error}")
-    with chromium:
-        yield chromium
 
 
 @pytest.mark.parametrize("width", [NARROW, WIDE])

@@ -1,0 +1,1 @@
+"""The page that plays a file of moving splats in a browser: one HTML text without a network."""

@@ -1,0 +1,124 @@
+// A camera that looks at a target: orbit, pan, zoom, fly, and ways from one place to another.
+
+import { add, between, cross, dot, fromColumns, mix, product, subtract, times, turnAbout, turned,
+  unit } from "./vectors.js";
+
+const STEEPEST = 0.02; // least angle between the line of sight and the orbit's axis [rad]
+const SECONDS = 0.35; // of a way
+
+/** Where one looks from; `turn` takes the axes of the camera (x right, y down, z ahead) to the world. */
+export class Camera {
+  constructor() {
+    this.target = [0, 0, 0];
+    this.distance = 4;
+    this.turn = [1, 0, 0, 0];
+    this.fovY = 0.7;
+    this.up = [0, 0, 1];
+    this.way = null;
+  }
+
+  get right() { return turned(this.turn, [1, 0, 0]); }
+
+  get down() { return turned(this.turn, [0, 1, 0]); }
+
+  get ahead() { return turned(this.turn, [0, 0, 1]); }
+
+  get position() { return subtract(this.target, times(this.distance, this.ahead)); }
+
+  /** Take the place that a file's header proposes; whatever it lacks is made up. */
+  start(scene) {
+    const bound = scene?.bound > 0 ? scene.bound : 1.3;
+    const view = scene?.view ?? {};
+    this.up = unit(vector(scene?.up) ?? [0, 0, 1]) ?? [0, 0, 1];
+    this.fovY = view.fov_y > 0 && view.fov_y < 3 ? view.fov_y : 0.7;
+    this.target = vector(view.target) ?? [0, 0, 0];
+    const aside = Math.abs(this.up[0]) < 0.9 ? [1, 0, 0] : [0, 1, 0];
+    const front = add(times(2.5 * bound, unit(cross(this.up, aside))), times(bound, this.up));
+    this.face(vector(view.position) ?? add(this.target, front), vector(view.up) ?? this.up);
+    this.way = null;
+  }
+
+  /** Look at the target from a place. */
+  face(position, up) {
+    const way = subtract(this.target, position);
+    const ahead = unit(way) ?? [0, 1, 0];
+    const right = unit(cross(ahead, up)) ?? unit(cross(ahead, [0.6, 0.64, 0.48]));
+    this.distance = Math.max(Math.hypot(...way), 1e-3);
+    this.turn = fromColumns(right, cross(ahead, right), ahead);
+  }
+
+  /** Turn about the target, by angles [rad]. */
+  orbit(sideways, upwards) {
+    const steepness = Math.acos(Math.min(1, Math.max(-1, dot(this.ahead, this.up))));
+    const highest = Math.max(0, steepness - STEEPEST);
+    const lowest = Math.min(0, steepness + STEEPEST - Math.PI);
+    const tilt = turnAbout(this.right, Math.min(highest, Math.max(lowest, upwards)));
+    this.turn = unit(product(turnAbout(this.up, sideways), product(tilt, this.turn)));
+    this.way = null;
+  }
+
+  /** Move sideways, so that what is as far away as the target follows a pointer [px]. */
+  pan(x, y, focal) {
+    const step = this.distance / focal;
+    this.target = subtract(this.target, add(times(step * x, this.right), times(step * y, this.down)));
+    this.way = null;
+  }
+
+  /** Come nearer to the target, or go away from it. */
+  zoom(factor) {
+    this.distance = Math.min(1e4, Math.max(1e-3, this.distance * factor));
+    this.way = null;
+  }
+
+  /** Fly with the target ahead, by a way in the camera's axes. */
+  fly(way) {
+    this.target = add(this.target, turned(this.turn, way));
+    this.way = null;
+  }
+
+  /** Begin to go to where something else is looked at; at once if `jump`. */
+  go(to, jump = false) {
+    const { target, distance, turn } = this;
+    this.way = { from: { target, distance, turn }, to: { target, distance, turn, ...to }, done: 0 };
+    if (jump) this.advance(SECONDS);
+  }
+
+  /** Go sideways until a place, in the camera's axes, is in the middle, and make it the target. */
+  goToSeen(seen, jump = false) {
+    const target = add(this.position, turned(this.turn, seen));
+    [this.target, this.distance] = [add(this.position, times(seen[2], this.ahead)), seen[2]];
+    this.go({ target }, jump);
+  }
+
+  /** Go on with a way for some seconds. */
+  advance(seconds) {
+    if (!this.way) return;
+    const { from, to } = this.way;
+    this.way.done = Math.min(1, this.way.done + seconds / SECONDS);
+    const f = this.way.done ** 2 * (3 - 2 * this.way.done);
+    this.target = mix(from.target, to.target, f);
+    this.distance = from.distance * (to.distance / from.distance) ** f;
+    this.turn = between(from.turn, to.turn, f);
+    if (this.way.done === 1) this.way = null;
+  }
+
+  /** Return the focal length [px] for a canvas: the angle of view is that of its shorter side. */
+  focal(width, height) {
+    return Math.min(width, height) / 2 / Math.tan(this.fovY / 2);
+  }
+
+  /** Return what the drawing needs to know: a rigid transform, row by row, and intrinsics [px]. */
+  view(width, height) {
+    const { position } = this;
+    const rows = [this.right, this.down, this.ahead].flatMap((axis) => [...axis, -dot(axis, position)]);
+    const focal = this.focal(width, height);
+    return {
+      world_to_camera: [...rows, 0, 0, 0, 1],
+      fx: focal, fy: focal, cx: width / 2, cy: height / 2, width, height,
+    };
+  }
+}
+
+function vector(given) {
+  return Array.isArray(given) && given.length === 3 && given.every(Number.isFinite) ? given : null;
+}
