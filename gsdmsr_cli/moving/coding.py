@@ -153,7 +153,7 @@ def decoded(header: Mapping[str, Any], parts: Mapping[str, Part]) -> Baked:
     if degree:
         rest = read.table("sh_rest", count, 3 * ((degree + 1) ** 2 - 1))
         colours = np.concatenate([colours, rest], axis=1)
-    sh = colours.reshape(count, -1, 3) @ _TO_RGB.T
+    sh = colours.reshape(count, (degree + 1) ** 2, 3) @ _TO_RGB.T
     turned = read.table("quats", count, 3)
     w = np.sqrt(np.clip(1 - np.square(turned).sum(axis=1, keepdims=True), 0, None))
     opacities = read.table("opacities", count, 1)[:, 0].clip(UNSEEN, 1 - UNSEEN)

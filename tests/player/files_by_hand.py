@@ -67,7 +67,10 @@ class File:
 
     def _parts(self) -> dict[str, tuple[dict[str, Any], bytes]]:
         parts = {"means": self._means()}
-        parts["of a later version"] = {"rows": 1, "columns": 1, "width": 1}, zlib.compress(b"a")
+        parts["of a later version"] = (
+            {"rows": 1, "columns": 1, "width": 1, "least": [0], "step": [1], "unknown": 2},
+            zlib.compress(b"a"),
+        )
         for name in [name for name in self.tables if name != "means"]:
             coding = "difference" if name.startswith("curves/") else CODINGS.get(name, "plain")
             width = WIDTHS.get(name, 2 if "/" in name else 1)
@@ -202,8 +205,6 @@ def _table(values: Array, width: int, coding: str) -> tuple[tuple[dict[str, Any]
         u = _signs_last(np.diff(q, axis=0, prepend=0))
         entry["difference"] = True
     entry |= {"least": least.tolist(), "step": step.tolist()}
-    if len(least) == 1:
-        entry |= {"least": float(least[0]), "step": float(step[0])}
     return (entry, _packed(u, width)), found
 
 
