@@ -56,6 +56,12 @@ def export(
         Path | None,
         typer.Option(metavar="DIR", help="Where the data lies now, to measure that loss."),
     ] = None,
+    embed: Annotated[
+        str | None,
+        typer.Option(
+            metavar="URL", help="Where an HTML page finds its file, instead of in itself."
+        ),
+    ] = None,
     set_: Annotated[
         list[str] | None,
         typer.Option("--set", metavar="a=v", help="One option of the format; repeatable."),
@@ -73,6 +79,7 @@ def export(
         "min_opacity": min_opacity,
         "lossy": lossy or None,
         "loss": loss,
+        "embed": embed,
     }
     named = {key: value for key, value in given.items() if value is not None}
     command.run(run_folder, format_, named, set_ or [], out, data)
