@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import torch
 from kernel_checks import generator
@@ -14,8 +15,12 @@ from gsdmsr_cli.gaussians.splats import Splats
 from gsdmsr_cli.model import motion as motions
 from gsdmsr_cli.model.layer import Facts, Instant, Layer, start_layer
 from gsdmsr_cli.model.model import MOTION, Model
+from gsdmsr_cli.options.preset import DensityOptions
+from gsdmsr_cli.training.population import Tick
+from gsdmsr_cli.training.population.density import Density
 from gsdmsr_cli.training.population.stillness import let_stand_still
 from gsdmsr_cli.training.resizing import resize_model
+from gsdmsr_cli.training.statistics import DensityStatistics
 
 FACTS = Facts(bound=1.3, box=((-1.3, -1.2, -1.1), (1.3, 1.4, 1.0)), frames=20)
 
@@ -84,3 +89,13 @@ def stand_still(model: Model, still: Tensor, where: Splats) -> list[int]:
 def are_among(points: Tensor, others: Tensor) -> bool:
     """Tell whether every point (N, 3) is one of the others, to the last bit."""
     return set(map(tuple, points.tolist())) <= set(map(tuple, others.tolist()))
+
+
+def pruned_to(model: Model) -> list[int]:
+    """Return the rows that density control keeps, where no splat is to grow."""
+    count = len(model.splats)
+    population = SimpleNamespace(
+        model=model, statistics=DensityStatistics(count), radius=100.0, generator=generator()
+    )
+    control = Density(DensityOptions())
+    return control.apply(cast(Any, population), Tick(1000, 0.9)).rows.tolist()

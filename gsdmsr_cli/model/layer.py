@@ -162,6 +162,13 @@ class Layer(ABC):
         """
         return None
 
+    def highest_opacities(self, splats: Splats) -> Tensor:
+        """Return the logits (N,) of the most that splats are opaque at any time of the capture.
+
+        By it density control prunes them. A layer that lets splats live for a while overrides it.
+        """
+        return splats.logit_opacities
+
     def scatter(  # noqa: B027  (most hold nothing that children differ in)
         self, children: Tensor, splats: Splats, shrink: float, generator: torch.Generator
     ) -> None:

@@ -245,6 +245,16 @@ class Model:
         return found
 
     @torch.no_grad()
+    def highest_opacities(self) -> Tensor:
+        """Return the logits of the most that splats are opaque at any time of the capture, (N,)."""
+        found = self.splats.logit_opacities.clone()
+        for layer in self.layers.values():
+            if count := self._rows(layer):
+                given = replace(self._firsts(count), logit_opacities=found[:count])
+                found[:count] = layer.highest_opacities(given)
+        return found
+
+    @torch.no_grad()
     def scatter(self, children: Tensor, shrink: float, generator: torch.Generator) -> None:
         """Let layers tell the children (N,) of splits apart, see ``Layer.scatter``."""
         for layer in self.layers.values():

@@ -84,11 +84,10 @@ class Covariance4D(Layer):
         """Return the slices of the Gaussians at a time."""
         splats, since = moment.splats, instant.time - self.times
         cut = self._slices(splats, slice(None))
-        exponents = since.square() / (2 * cut.variances)
         drawn = replace(
             splats,
             means=splats.means + since[:, None] * cut.velocities,
-            logit_opacities=fade(splats.logit_opacities, exponents),
+            logit_opacities=_seen(splats, since, cut.variances),
             sh=splats.sh if self.sh is None else self._colours(splats.sh, since, self.sh),
         )
         return replace(moment, splats=drawn, axes=cut.axes)
@@ -108,6 +107,11 @@ class Covariance4D(Layer):
         """Return lives about the times of the means, as long as the marginals."""
         durations = (2 * self._slices(splats, slice(None)).variances).log() / 2
         return torch.stack([self.times, self.times, durations, durations], dim=1).detach()
+
+    def highest_opacities(self, splats: Splats) -> Tensor:
+        """Return the logits at the times of the capture that are nearest to the means."""
+        variances = self._slices(splats, slice(None)).variances
+        return _seen(splats, self.times.clamp(0, 1) - self.times, variances)
 
     def begin_at(self, times: Tensor) -> None:
         """Let splats be seen around the times at which their points were."""
@@ -132,6 +136,11 @@ class Covariance4D(Layer):
         self.times[rows] += later
         splats.means[rows] += later[:, None] * cut.velocities
         self.log_durations[rows] -= math.log(shrink)
+
+
+def _seen(splats: Splats, since: Tensor, variances: Tensor) -> Tensor:
+    """Return the logits (N,) of the opacities times the marginals."""
+    return fade(splats.logit_opacities, since.square() / (2 * variances))
 
 
 def start(

@@ -90,7 +90,7 @@ class Vibration(Layer):
         splats = replace(
             moment.splats,
             means=moment.splats.means + (self.bound * way)[:, None] * self.velocities,
-            logit_opacities=fade(moment.splats.logit_opacities, (since / spans).square() / 2),
+            logit_opacities=_seen(moment.splats, since, spans),
         )
         return replace(moment, splats=splats)
 
@@ -106,6 +106,10 @@ class Vibration(Layer):
         """Return lives about the peaks."""
         durations = self._life_spans().log() + 0.5 * math.log(2)
         return torch.stack([self.peaks, self.peaks, durations, durations], dim=1).detach()
+
+    def highest_opacities(self, splats: Splats) -> Tensor:
+        """Return the logits at the times of the capture that are nearest to the peaks."""
+        return _seen(splats, self.peaks.clamp(0, 1) - self.peaks, self._life_spans())
 
     def begin_at(self, times: Tensor) -> None:
         """Let lives have their peaks at the times at which splats were seen."""
@@ -130,6 +134,11 @@ class Vibration(Layer):
         slowed = torch.cos(2 * math.pi / self.options.period * later)
         self.velocities[rows] = slowed[:, None] * velocities
         self.log_life_spans[rows] -= math.log(shrink)
+
+
+def _seen(splats: Splats, since: Tensor, spans: Tensor) -> Tensor:
+    """Return the logits (N,) of the opacities, so long since the peaks of lives."""
+    return fade(splats.logit_opacities, (since / spans).square() / 2)
 
 
 def start(options: Options, facts: Facts, splats: Splats, generator: torch.Generator) -> Vibration:

@@ -60,8 +60,9 @@ class Density(Event):
         self.rounds += growing
         model, given = population.model, (population.radius, growing, population.generator)
         change = grow_and_prune(
-            model.splats, population.statistics, self.options, *given, model.to_split()
-        )
+            model.splats, population.statistics, self.options, *given, model.to_split(),
+            model.highest_opacities(),
+        )  # fmt: skip
         if not len(change.rows):
             raise GsdmsrError(
                 f"no splats are left at step {tick.step}; lower density.prune_opacity or "
@@ -93,6 +94,7 @@ def grow_and_prune(
     growing: bool,
     generator: torch.Generator,
     to_split: Tensor | None = None,
+    highest: Tensor | None = None,
 ) -> Resize:
     """Decide which splats go on, and which are cloned and split.
 
@@ -104,12 +106,14 @@ def grow_and_prune(
         growing: whether splats may be cloned and split, or only pruned.
         generator: source of the split children's positions.
         to_split: (N,) bool, splats that are split if they grow, even if they are small.
+        highest: (N,) logits of the most that splats are opaque at any time, if not what is stored.
 
     Returns:
         which splats there are to be; the children have been moved and shrunk.
     """
     largest = splats.log_scales.exp().amax(dim=1)
-    kept = torch.sigmoid(splats.logit_opacities) >= options.prune_opacity
+    logits = splats.logit_opacities if highest is None else highest
+    kept = torch.sigmoid(logits) >= options.prune_opacity
     kept &= largest <= options.prune_scale * radius
     for tensor in splats.tensors().values():
         kept &= tensor.isfinite().reshape(len(splats), -1).all(dim=1)

@@ -10,7 +10,15 @@ import numpy as np
 import pytest
 import torch
 from kernel_checks import generator
-from motion_checks import disturbed, model_of, moved_by, splats_of, stand_still, started
+from motion_checks import (
+    disturbed,
+    model_of,
+    moved_by,
+    pruned_to,
+    splats_of,
+    stand_still,
+    started,
+)
 from seam_checks import assert_trains_the_same_in_all_ways
 from torch import Tensor
 from torch.nn.functional import normalize
@@ -153,6 +161,19 @@ def test_splats_that_are_long_in_time_are_to_be_split() -> None:
     with torch.no_grad():
         motion.tensors()["log_durations"][1] = math.log(0.09)
     assert motion.to_split().tolist() == [True, False, True]
+
+
+@torch.no_grad()
+def test_density_control_prunes_what_has_left_the_capture() -> None:
+    """But not what is seen at its end, nor what stands still there."""
+    splats, motion = splats_of(COUNT), started(NAME, 4, duration=0.05)
+    splats.logit_opacities.fill_(2.0)
+    motion.tensors()["times"].copy_(torch.tensor([0.5, -0.4, 1.04, 1.5]))
+    model = model_of(splats, motion, moving=4)
+    assert pruned_to(model) == [0, 2, 4]
+    found = model.highest_opacities().sigmoid()
+    torch.testing.assert_close(found[[0, 4]], torch.sigmoid(torch.tensor([2.0, 2.0])))
+    assert found[2].item() == pytest.approx(0.8808 * math.exp(-0.32), rel=1e-3)
 
 
 def test_times_that_are_known_are_begun_with() -> None:

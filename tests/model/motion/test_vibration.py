@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 from kernel_checks import generator
-from motion_checks import FACTS, disturbed, moved_by, splats_of, started
+from motion_checks import FACTS, disturbed, model_of, moved_by, pruned_to, splats_of, started
 from seam_checks import assert_trains_the_same_in_all_ways
 from torch import Tensor
 
@@ -91,6 +91,17 @@ def test_splats_with_a_long_life_are_to_be_split() -> None:
         motion.tensors()["log_life_spans"][1] = math.log(0.09)
     split = motion.to_split()
     assert split is not None and split.tolist() == [True, False, True]
+
+
+@torch.no_grad()
+def test_density_control_prunes_what_has_left_the_capture() -> None:
+    splats, motion = splats_of(4), started(NAME, 4, life_span=0.05)
+    splats.logit_opacities.fill_(2.0)
+    motion.tensors()["peaks"].copy_(torch.tensor([0.5, -0.4, 1.04, 1.5]))
+    model = model_of(splats, motion)
+    assert pruned_to(model) == [0, 2]
+    found = model.highest_opacities().sigmoid()
+    assert found[2].item() == pytest.approx(0.8808 * math.exp(-0.32), rel=1e-3)
 
 
 def test_peaks_are_where_splats_were_seen_if_that_is_known() -> None:
