@@ -25,8 +25,8 @@ class Options:
     """Settings.
 
     Attributes:
-        tolerance: how far what is drawn may be off by the rounding of one tensor: of centres in
-            units of the splats' sizes, of rotations [rad], of log scales, opacities and colours.
+        tolerance: how far what is drawn may be off by rounding, see ``tolerance.distance``: centres
+            in units of the splats' sizes, rotations [rad], log scales, opacities and colours.
     """
 
     tolerance: float = TOLERANCE

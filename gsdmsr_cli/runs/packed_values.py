@@ -9,20 +9,21 @@ from __future__ import annotations
 import lzma
 import math
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from gsdmsr_cli.ground.errors import DataError
-
 Array = NDArray[Any]
 
 KINDS = "steps", "half", "codes", "raw"
 
-MOST_BITS = 16
+MOST_HALF = 65504.0
+"""The largest value of the kind "half"."""
+
+_MOST_BITS = 16
 """Of a value that is rounded to steps."""
 
 _ENDS = 8
@@ -42,33 +43,46 @@ _MEMORY = 1 << 25
 """Most that decompression may take: the dictionary and a little [bytes]."""
 
 
-def rounded(values: Array, bits: int) -> Array:
-    """Return values (...) float32 as so many bits leave them, 1 to 16: whole numbers of steps
-    between the least and the largest."""
-    return _from_steps(*_to_steps(values, bits))
+class Form(NamedTuple):
+    """How the values of a tensor are written.
+
+    Attributes:
+        kind: one of ``KINDS``: whole numbers of steps between the least and the largest value, 16
+            bits each, codes (N, stages) uint8, or as they are, of any type.
+        bits: of each value that is rounded to steps, 1 to 16.
+    """
+
+    kind: str
+    bits: int = 0
 
 
-def encode(values: Array, kind: str, bits: int = 0) -> tuple[Tensor, dict[str, Any]]:
+HALF, CODES, RAW = Form("half"), Form("codes"), Form("raw")
+
+
+def rounded(values: Array, form: Form) -> Array:
+    """Return values (...) float32 as a form leaves them; halves are finite."""
+    if form.kind == "steps":
+        return _from_steps(*_to_steps(values, form.bits))
+    return values if form.kind == "raw" else values.astype("<f2").astype(np.float32)
+
+
+def encode(values: Array, form: Form) -> tuple[Tensor, dict[str, Any]]:
     """Return a tensor's bytes (B,) uint8, and what tells how to read them, plain JSON.
 
     Args:
-        values: of the tensor, all finite; of the kind "codes", the codes (N, stages) uint8.
-        kind: one of ``KINDS``.
-        bits: of each value of the kind "steps", 1 to 16.
-
-    Raises:
-        DataError: a value is too large for 16 bits, of the kind "half".
+        values: of the tensor, all finite, and at most ``MOST_HALF`` in size where they are halves.
+        form: how they are written.
     """
-    about = {"kind": kind, "shape": list(values.shape), "type": str(values.dtype)}
-    if kind != "steps":
-        return _as_tensor(_compressed(_PLAIN[kind](values))), about
-    levels, ends = _to_steps(values, bits)
+    about = {"kind": form.kind, "shape": list(values.shape), "type": str(values.dtype)}
+    if form.kind != "steps":
+        return _as_tensor(_compressed(_PLAIN[form.kind](values))), about
+    levels, ends = _to_steps(values, form.bits)
     found: list[tuple[int, int | None, bytes]] = []
     for axis in (None, *(axis for axis, size in enumerate(values.shape) if size > 1)):
         data = _compressed(_column_bytes(levels if axis is None else _differences(levels, axis)))
         found.append((len(data), axis, data))
     _, along, data = min(found, key=lambda each: each[0])
-    return _as_tensor(ends.tobytes() + data), about | {"along": along, "bits": bits}
+    return _as_tensor(ends.tobytes() + data), about | {"along": along, "bits": form.bits}
 
 
 def decode(data: Tensor, about: Mapping[str, Any]) -> Array:
@@ -112,7 +126,7 @@ def _from_steps(levels: Array, ends: Array) -> Array:
 
 
 def _dtype_of(bits: int) -> np.dtype[Any]:
-    if not 1 <= bits <= MOST_BITS:
+    if not 1 <= bits <= _MOST_BITS:
         raise ValueError(f"{bits} bits a value")
     return np.dtype("<u1" if bits <= 8 else "<u2")
 
@@ -135,14 +149,6 @@ def _sums(folded: Array, axis: int) -> Array:
     return np.cumsum((folded >> one) ^ signs, axis=axis, dtype=folded.dtype)
 
 
-def _halves(values: Array) -> bytes:
-    with np.errstate(over="ignore"):
-        halves = values.astype("<f2")
-    if not np.isfinite(halves).all():
-        raise DataError("a value is too large for 16 bits")
-    return _column_bytes(halves)
-
-
 def _column_bytes(values: Array) -> bytes:
     """Return values column by column, all lower bytes before all higher ones.
 
@@ -161,7 +167,7 @@ def _from_columns(data: bytes, shape: tuple[int, ...], dtype: np.dtype[Any]) -> 
 
 
 _PLAIN: dict[str, Callable[[Array], bytes]] = {
-    "half": _halves,
+    "half": lambda values: _column_bytes(values.astype("<f2")),
     "codes": lambda values: values.T.tobytes(),
     "raw": lambda values: values.tobytes(),
 }

@@ -2,7 +2,7 @@
 
 Splats that are never drawn are left out, the others put in Morton order. Rotations and scales are
 the codes of the layer ``quantise`` where there is one. All else has as few bits a value as leave
-what is drawn where it is, within a tolerance, and 16 where nobody can tell; all is compressed.
+what is drawn where it is, within a tolerance; all is compressed.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from gsdmsr_cli.model.layers.quantise import Quantise, decode
 from gsdmsr_cli.model.model import FURTHER, MOVING, STORED_AS, Model
 from gsdmsr_cli.model.parameter import Parameter
 from gsdmsr_cli.runs import packed_values
-from gsdmsr_cli.runs.tolerance import bits_of
+from gsdmsr_cli.runs.tolerance import forms_of
 
 Description = dict[str, Any]
 """The "layout" and how each of the "tensors" is written, see ``packed_values.encode``; JSON."""
@@ -30,8 +30,8 @@ Description = dict[str, Any]
 LAYOUT = 2
 """Of what is packed. In 1 values had 8 bits between the ends of their column, or 16, deflated."""
 
-TOLERANCE = 0.02
-"""How far what is drawn may be off by the rounding of one tensor, see ``tolerance.distance``."""
+TOLERANCE = 0.08
+"""How far what is drawn may be off by rounding, see ``tolerance.distance``."""
 
 _BOOKS = f"{FURTHER}quantise."
 
@@ -44,7 +44,7 @@ def pack(model: Model, tolerance: float = TOLERANCE) -> tuple[dict[str, Tensor],
 
     Args:
         model: what is packed.
-        tolerance: see ``tolerance.bits_of``.
+        tolerance: see ``tolerance.forms_of``.
 
     Raises:
         DataError: a value is not finite.
@@ -53,19 +53,19 @@ def pack(model: Model, tolerance: float = TOLERANCE) -> tuple[dict[str, Tensor],
     rows = _in_order(model)
     model.take(rows, torch.zeros_like(rows, dtype=torch.bool))
     codes = _settle(model)
-    rounded = [p.name for p in model.parameters() if _is_trained(p) and p.name not in codes]
-    bits = bits_of(model, tolerance, rounded)
+    trained = [p.name for p in model.parameters() if _is_trained(p) and p.name not in codes]
+    forms = forms_of(model, tolerance, trained)
     packed: dict[str, Tensor] = {}
     described: dict[str, dict[str, Any]] = {}
-    for parameter in model.parameters():
-        name, values = parameter.name, parameter.tensor.detach().cpu().numpy()
-        kind = "steps" if name in bits else "half" if _is_trained(parameter) else "raw"
+    for name, tensor in model.tensors().items():
         if name in codes:
-            kind, values = "codes", codes[name].cpu().numpy().astype(np.uint8)
-        packed[name], described[name] = packed_values.encode(values, kind, bits.get(name, 0))
+            given, form = codes[name].cpu().numpy().astype(np.uint8), packed_values.CODES
+        else:
+            given, form = tensor.detach().cpu().numpy(), forms.get(name, packed_values.RAW)
+        packed[name], described[name] = packed_values.encode(given, form)
     if model.moving < len(model.splats):
         moving = np.array(model.moving, np.int64)
-        packed[MOVING], described[MOVING] = packed_values.encode(moving, "raw")
+        packed[MOVING], described[MOVING] = packed_values.encode(moving, packed_values.RAW)
     return packed, {"layout": LAYOUT, "tensors": described}
 
 

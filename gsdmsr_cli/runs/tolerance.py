@@ -1,4 +1,4 @@
-"""How many bits each tensor of a model needs for what is drawn to stay where it is, nearly.
+"""In how few bits a model's tensors may be stored for what is drawn to stay where it is, nearly.
 
 A tensor's values are rounded, and the splats that are drawn at some moments compared with what they
 were. So neither the data nor a rule for each kind of motion is needed.
@@ -7,7 +7,7 @@ were. So neither the data nor a rule for each kind of motion is needed.
 from __future__ import annotations
 
 from bisect import bisect_left
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 
 import numpy as np
 import torch
@@ -16,57 +16,66 @@ from torch import Tensor
 from gsdmsr_cli.gaussians.moment import Moment
 from gsdmsr_cli.ground.geometry import SH_C0
 from gsdmsr_cli.model.model import Model
-from gsdmsr_cli.model.parameter import Parameter
-from gsdmsr_cli.runs.packed_values import MOST_BITS, rounded
+from gsdmsr_cli.runs.packed_values import HALF, MOST_HALF, RAW, Form, rounded
 from gsdmsr_cli.scene.camera import Camera
 
 MOMENTS = 5
 """Times, evenly spaced, at which splats are compared."""
 
-LEAST_BITS = 4
+STEPS = tuple(Form("steps", bits) for bits in range(4, 17))
+"""The steps that a tensor may be rounded to, the coarsest first."""
+
+_TRIES = 12
+"""How often the share of a tensor is halved, where all together are off by more than tolerated."""
 
 
 @torch.no_grad()
-def bits_of(model: Model, tolerance: float, names: Collection[str]) -> dict[str, int]:
-    """Return the least bits of each value, by the name of the tensor; the model stays as it is.
+def forms_of(model: Model, tolerance: float, names: Collection[str]) -> dict[str, Form]:
+    """Return in which form each of the tensors is stored, by its name; the model stays as it is.
 
-    A tensor is left out where 16 bits do not do, or where nothing shows that it is rounded at all,
-    as with what makes colours anew after drawing.
+    Steps of as few bits as do, or halves, or float32 where neither does. What nothing shows of, as
+    of what makes colours anew after drawing, has halves.
 
     Args:
         model: of N splats.
-        tolerance: how far what is drawn may be off by the rounding of one tensor, see ``distance``.
-        names: of the tensors, trained ones.
+        tolerance: how far what is drawn may be off with all tensors rounded, see ``distance``.
+        names: of the tensors, float32.
     """
     exact = [moment.map(torch.clone) for moment in _drawn(model)]
-    found = {}
-    for parameter in (p for p in model.parameters() if p.name in names):
-        bits = _least_bits(model, parameter, exact, tolerance)
-        if bits is not None:
-            found[parameter.name] = bits
-    return found
+    share = tolerance / max(len(names), 1) ** 0.5  # as if they had nothing to do with one another
+    for _ in range(_TRIES):
+        found = {name: _form_of(model, name, exact, share) for name in names}
+        if _off(model, found, exact) <= tolerance:
+            return found
+        share /= 2
+    return dict.fromkeys(names, RAW)
 
 
-def _least_bits(
-    model: Model, parameter: Parameter, exact: list[Moment], tolerance: float
-) -> int | None:
-    values = parameter.tensor.detach().clone()
-    own = values.cpu().numpy()
-    if not own.size or own.min() == own.max():
-        return LEAST_BITS  # exact at any
+def _form_of(model: Model, name: str, exact: list[Moment], tolerance: float) -> Form:
+    """Return the form that keeps one tensor by itself to a tolerance."""
+    values = model.tensors()[name]
+    if not values.numel() or values.min() == values.max():
+        return STEPS[0]  # exact
+    half = HALF if float(values.abs().max()) <= MOST_HALF else RAW
+    if _off(model, {name: STEPS[0]}, exact) == 0:
+        return half
+    place = bisect_left(STEPS, True, key=lambda form: _off(model, {name: form}, exact) <= tolerance)
+    if place < len(STEPS):
+        return STEPS[place]
+    return half if _off(model, {name: half}, exact) <= tolerance else RAW
 
-    def off_at(bits: int) -> float:
-        parameter.tensor.copy_(torch.from_numpy(rounded(own, bits)))
-        return distance(exact, _drawn(model))
 
+def _off(model: Model, forms: Mapping[str, Form], exact: list[Moment]) -> float:
+    """Return the distance with tensors rounded to these forms, by their names."""
+    tensors = {name: model.tensors()[name] for name in forms}
+    before = {name: tensor.detach().clone() for name, tensor in tensors.items()}
+    for name, tensor in tensors.items():
+        tensor.copy_(torch.from_numpy(rounded(tensor.cpu().numpy(), forms[name])))
     try:
-        choices = range(LEAST_BITS, MOST_BITS + 1)
-        if off_at(LEAST_BITS) == 0:
-            return None
-        place = bisect_left(choices, True, key=lambda bits: off_at(bits) <= tolerance)
-        return choices[place] if place < len(choices) else None
+        return distance(exact, _drawn(model))
     finally:
-        parameter.tensor.copy_(values)
+        for name, tensor in tensors.items():
+            tensor.copy_(before[name])
         _forget(model)
 
 
