@@ -95,11 +95,18 @@ class Chromium:
         message, self._rest = self._rest.split(b"\0", 1)
         return dict(json.loads(message))
 
-    def open(self, path: Path, width: int, scheme: str = "light", fragment: str = "") -> None:
-        """Show a file on a screen of a width [px], "light" or "dark"; return when it is there."""
+    def open(
+        self,
+        path: Path,
+        width: int,
+        scheme: str = "light",
+        fragment: str = "",
+        height: int = 900,
+    ) -> None:
+        """Show a file on a screen of a size [px], "light" or "dark"; return when it is there."""
         self.call(
             "Emulation.setDeviceMetricsOverride",
-            width=width, height=900, deviceScaleFactor=1, mobile=width < 600,
+            width=width, height=height, deviceScaleFactor=1, mobile=width < 600,
         )  # fmt: skip
         self.call("Emulation.setTouchEmulationEnabled", enabled=width < 600)
         feature = {"name": "prefers-color-scheme", "value": scheme}

@@ -15,6 +15,7 @@ export class Helper {
     this.onOrder = onOrder;
     this.onFault = onFault;
     this.sortMilliseconds = [];
+    this.orders = 0;
     this.loaded = false;
     this.current = null; // what the last order that came was for
     this.running = null;
@@ -63,6 +64,7 @@ export class Helper {
         const wanted = this.wanted;
         this.wanted = null;
         const { order, milliseconds } = await this.call({ wanted });
+        this.orders += 1;
         note(this.sortMilliseconds, milliseconds);
         this.current = wanted;
         this.onOrder(order);

@@ -173,6 +173,7 @@ function offer(player, ready) {
       player.fixed = view;
       player.invalidate();
     },
+    view: () => player.view(),
     background: (colour) => {
       player.background = colour;
       player.changed();

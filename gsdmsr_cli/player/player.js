@@ -6,7 +6,7 @@ import { median, note } from "./figures.js";
 import { Helper } from "./helper.js";
 
 const DENSEST = 2; // most pixels of the canvas for one of the page along a side
-const LONGEST = 0.1; // that a frame counts for: the page may have been hidden [s]
+const LONGEST = 0.5; // that a frame counts for: the page may have been hidden [s]
 
 /** A canvas on which a scene plays. */
 export class Player {
@@ -20,6 +20,7 @@ export class Player {
     this.drawing = new Drawing(canvas);
     this.scene = null;
     this.bytes = null;
+    this.loading = null; // a promise: the last file that came is shown, or refused
     this.coming = null; // a scene whose first order is on its way
     this.time = 0;
     this.playing = false;
@@ -31,6 +32,7 @@ export class Player {
     this.scheduled = false;
     this.before = null;
     this.scriptMilliseconds = [];
+    this.frames = 0;
     this.firstPicture = null;
     canvas.addEventListener("webglcontextlost", (event) => {
       event.preventDefault();
@@ -42,11 +44,17 @@ export class Player {
 
   /** Show what these bytes of a file hold; camera and time stay where they are if there are any. */
   async load(bytes) {
+    const taken = this.take(bytes);
+    this.loading = taken.catch(() => {}); // who waits for a picture gets that of what there is
+    await taken;
+  }
+
+  async take(bytes) {
     const scene = await this.helper.load(bytes);
     if (!this.scene) this.camera.start(scene.header.scene);
     this.bytes = bytes;
     this.coming = scene;
-    await this.draw();
+    await this.settle();
   }
 
   takeOrder(order) {
@@ -114,6 +122,7 @@ export class Player {
       const view = this.view();
       this.paint(view);
       this.helper.ask(this.wanted(view));
+      this.frames += 1;
       note(this.scriptMilliseconds, performance.now() - begun);
     }
     if (goesOn) this.invalidate();
@@ -143,6 +152,11 @@ export class Player {
 
   /** Draw in the exact order for this time and camera; return when it is on the canvas. */
   async draw() {
+    await this.loading;
+    await this.settle();
+  }
+
+  async settle() {
     await this.helper.exact(this.wanted());
     if (this.scene && this.drawing) this.paint(this.view());
   }
@@ -195,9 +209,9 @@ export class Player {
     return {
       splats: header?.splats, moving: header?.moving, bytes: this.bytes?.length,
       decode_ms: milliseconds, first_picture_ms: this.firstPicture,
-      frames: this.scriptMilliseconds.length, script_ms: median(this.scriptMilliseconds),
-      sort_ms: median(this.helper.sortMilliseconds),
-      target: this.drawing?.half ? "RGBA16F" : "RGBA8",
+      frames: this.frames, script_ms: median(this.scriptMilliseconds),
+      sort_ms: median(this.helper.sortMilliseconds), orders: this.helper.orders,
+      target: this.drawing && (this.drawing.half ? "RGBA16F" : "RGBA8"),
     };
   }
 }
