@@ -15,6 +15,7 @@ PACKAGE = Path(gsdmsr_cli.__file__).parent
 ROOMS = (
     "ground", "backends", "options", "gaussians", "scene", "ops", "raster", "model", "moving",
     "drawing", "runs", "formats", "player", "exports", "paths", "evaluation", "filming",
+    "viewing",
     "reporting", "training", "capture", "demo", "benchmark", "commands", "cli",
 )  # fmt: skip
 """The folders of the package, from the ground up: each imports only from those before it."""

@@ -20,6 +20,7 @@ PANELS = {
     "Pictures": ("output", "video", "size", "scale", "supersample", "fps"),
     "Output": (
         "out", "overwrite", "keep", "keep_stages", "report", "dry_run", "tensorboard", "wandb",
+        "view_", "port",
     ),
     "Machine": ("device", "threads", "jobs"),
 }  # fmt: skip
@@ -35,6 +36,7 @@ EXAMPLES = {
     "compare": "gsdmsr compare runs/dog runs/other --out compare.html",
     "render": "gsdmsr render runs/dog --path orbit --frames 90 --video mp4",
     "export": "gsdmsr export runs/dog --format ply --time 0.5 --out half.ply",
+    "view": "gsdmsr view runs/dog --open",
     "info": "gsdmsr info runs/dog",
     "demo": "gsdmsr demo --out gsdmsr-demo",
     "presets": "gsdmsr presets video",

@@ -28,6 +28,7 @@ from gsdmsr_cli.cli import (
     presets,
     render,
     train,
+    view,
     weights,
 )
 from gsdmsr_cli.cli import eval as evaluate
@@ -40,8 +41,8 @@ from gsdmsr_cli.ground.streams import unfailing
 # These files import gsdmsr_cli.commands in the functions that run them: torch alone would make
 # --help slow.
 _COMMANDS = (
-    prepare, train, evaluate, compare, render, export, info, demo, presets, doctor, weights, cache,
-    benchmark,
+    prepare, train, view, evaluate, compare, render, export, info, demo, presets, doctor, weights,
+    cache, benchmark,
 )  # fmt: skip
 """In the order of --help."""
 

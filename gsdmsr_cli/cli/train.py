@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -67,6 +68,12 @@ def train(
         str | None,
         typer.Option(metavar="PROJECT", help="Log to Weights & Biases too; needs wandb."),
     ] = None,
+    view: Annotated[
+        bool, typer.Option("--view", help="Serve a page that shows the training.")
+    ] = False,
+    port: Annotated[
+        int, typer.Option(min=0, max=65535, metavar="N", help="Port of that page; 0 a free one.")
+    ] = 0,
 ) -> None:
     """Reconstruct a moving scene from its pictures."""
     if budget is not None and steps is not None:
@@ -85,6 +92,7 @@ def train(
     overrides = *(set_ or ()), *_overrides(options)
     named = data, out, preset, config, overrides, device
     request = Request(*named, resume, overwrite, dry_run, verify_data, tensorboard, wandb)
+    request = replace(request, view_port=port if view else None)
     from gsdmsr_cli.commands import train as command
 
     command.run(request)

@@ -19,6 +19,7 @@ from gsdmsr_cli.commands._observers import OnReport, Wanted, find_observers, obs
 from gsdmsr_cli.commands._plan import say_plan
 from gsdmsr_cli.commands._progress import progress_bar
 from gsdmsr_cli.commands._training_display import TrainingDisplay
+from gsdmsr_cli.commands._viewed import viewed
 from gsdmsr_cli.formats import needs_preparing, read_scene
 from gsdmsr_cli.ground import limits, machine, say
 from gsdmsr_cli.ground.errors import DataError, UsageError
@@ -83,8 +84,12 @@ def _train(
         trainer.renderer.cache_in(folder.root)
         timings = {"load_s": load_s, "compile_s": _start_work(trainer, device)}
         processes, began = len(trainer.workers), trainer.clock.step
-        with TrainingDisplay() as display, observing(observers, folder, began) as hand_on:
-            finished = train(trainer, folder, _both(display.show, hand_on), say.warn)
+        with (
+            TrainingDisplay() as display,
+            observing(observers, folder, began) as hand_on,
+            viewed(folder, trainer, request.view_port) as offer,
+        ):
+            finished = train(trainer, folder, _all(display.show, hand_on, offer), say.warn)
     account = _write_account(folder, trainer, device, timings, processes)
     _say_end(folder, trainer, request.data, finished)
     if not finished:
@@ -92,10 +97,10 @@ def _train(
     say.result({"run": str(folder.root), "preset": folder.name, "reason": folder.reason, **account})
 
 
-def _both(first: OnReport, second: OnReport) -> OnReport:
+def _all(*observers: OnReport) -> OnReport:
     def show(report: Report) -> None:
-        first(report)
-        second(report)
+        for observer in observers:
+            observer(report)
 
     return show
 

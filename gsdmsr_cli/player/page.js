@@ -2,6 +2,7 @@
 
 import { control, hasModifier, isTyping, resetView } from "./controls.js";
 import { FileError } from "./decode.js";
+import { address, follow } from "./live.js";
 import { Player, reducedMotion } from "./player.js";
 
 const BACKGROUNDS = [["scene's own", null], ["white", [1, 1, 1]], ["black", [0, 0, 0]]];
@@ -45,6 +46,7 @@ async function begin(player) {
   element("message").textContent = "";
   if (!options.has("paused") && !options.has("time") && !reducedMotion()) player.setPlaying(true);
   player.changed();
+  if ("live" in element("file").dataset) follow(player, tell);
 }
 
 /** Return the file that stands in the page, or lies where it says. */
@@ -53,7 +55,7 @@ async function fileOfThePage() {
   if (!dataset.url) return Uint8Array.from(atob(textContent.trim()), (letter) => letter.charCodeAt(0));
   let answer = null;
   try {
-    answer = await fetch(dataset.url);
+    answer = await fetch("live" in dataset ? address(dataset.url) : dataset.url);
   } catch {
     const why = location.protocol === "file:"
       ? "a page that is opened from a disk may not read other files: put both on a web server, or export the page without --embed"

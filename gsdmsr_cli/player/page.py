@@ -13,25 +13,26 @@ from gsdmsr_cli.ground import splatting_constants
 
 SCRIPTS = (
     "vectors", "figures", "decode", "moving", "tables", "sort", "worker", "helper", "shaders",
-    "draw", "camera", "player", "controls", "page", "main",
+    "draw", "camera", "player", "controls", "live", "page", "main",
 )  # fmt: skip
 """The modules of the script, each after those whose values it needs when it is read."""
 
 _CONSTANTS = "NEAR", "DILATION", "ALPHA_MIN", "ALPHA_MAX", "FRUSTUM_MARGIN"
 
 _POLICY = (
-    "default-src 'none'; img-src data: blob:; style-src 'unsafe-inline'; "
+    "default-src 'none'; img-src data: blob:{pictures}; style-src 'unsafe-inline'; "
     "script-src 'unsafe-inline'; worker-src blob:; connect-src {origin}"
 )
 
 
-def page(data: bytes | None, embed_url: str | None, title: str) -> str:
+def page(data: bytes | None, embed_url: str | None, title: str, live: bool = False) -> str:
     """Return the page.
 
     Args:
         data: a file of moving splats (docs/file-format.md) that the page is to hold.
         embed_url: where the page finds the file in place of that, from where it lies itself.
         title: of the window, plain text.
+        live: whether a server answers beside it how a training stands, see ``viewing``.
 
     Raises:
         ValueError: there are both data and a URL, or neither.
@@ -39,10 +40,14 @@ def page(data: bytes | None, embed_url: str | None, title: str) -> str:
     if (data is None) == (embed_url is None):
         raise ValueError("a page holds the data or the URL of a file, one of them")
     texts = {
-        "policy": _POLICY.format(origin="'none'" if embed_url is None else _origin(embed_url)),
+        "policy": _POLICY.format(
+            origin="'none'" if embed_url is None else _origin(embed_url),
+            pictures=" 'self'" if live else "",
+        ),
         "title": escape(title),
         "style": _text("page.css"),
-        "url": "" if embed_url is None else f' data-url="{escape(embed_url)}"',
+        "url": ("" if embed_url is None else f' data-url="{escape(embed_url)}"')
+        + (" data-live" if live else ""),
         "data": "" if data is None else base64.b64encode(data).decode("ascii"),
         "script": script(),
     }

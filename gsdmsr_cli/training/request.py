@@ -25,6 +25,7 @@ class Request:
         verify: take hashes of whole pictures, which a resumed training compares.
         tensorboard: hand the reports to TensorBoard.
         wandb: project of Weights & Biases that gets them, or None.
+        view_port: of the page that shows the training, 0 for a free one; None serves none.
 
     Raises:
         UsageError: two options exclude each other.
@@ -42,6 +43,7 @@ class Request:
     verify: bool = False
     tensorboard: bool = False
     wandb: str | None = None
+    view_port: int | None = None
 
     def __post_init__(self) -> None:
         if self.resume and self.overwrite:
