@@ -29,7 +29,7 @@ Gsdmsr = Any  # the fixture of conftest.py
         ),
         (
             "train --data d --out r --preset dnerf --config f.yaml --set a.b=1 --set a.c=2"
-            " --device cpu --resume --verify-data --tensorboard --wandb p",
+            " --device cpu --resume --verify-data --tensorboard --wandb p --view --port 80",
             "train",
             (
                 Training(
@@ -43,9 +43,13 @@ Gsdmsr = Any  # the fixture of conftest.py
                     verify=True,
                     tensorboard=True,
                     wandb="p",
+                    view_port=80,
                 ),
             ),
         ),
+        ("train --data d --out r --view", "train", (Training(Path("d"), Path("r"), view_port=0),)),
+        ("view r", "view", (Path("r"), "127.0.0.1", 0, None, False)),
+        ("view r --port 9 --host h --data d --open", "view", (Path("r"), "h", 9, Path("d"), True)),
         ("eval r", "eval", (Path("r"), Evaluation(), Demands(), Output(), None)),
         (
             "eval r --split val --background both --downscale 2 --lpips-weights w --lpips-inria"
@@ -100,17 +104,17 @@ Gsdmsr = Any  # the fixture of conftest.py
         (
             "export r --format ply --time 0.5 --out o",
             "export",
-            (Path("r"), "ply", {"time": 0.5}, [], Path("o")),
+            (Path("r"), "ply", {"time": 0.5}, [], Path("o"), None),
         ),
         (
             "export r --format ply-sequence --frames 3 --out o",
             "export",
-            (Path("r"), "ply-sequence", {"frames": 3}, [], Path("o")),
+            (Path("r"), "ply-sequence", {"frames": 3}, [], Path("o"), None),
         ),
         (
             "export r --format ply --set time=0.5 --set a=1 --out o",
             "export",
-            (Path("r"), "ply", {}, ["time=0.5", "a=1"], Path("o")),
+            (Path("r"), "ply", {}, ["time=0.5", "a=1"], Path("o"), None),
         ),
         (
             "export r --format ply --axes y-up --scale 2 --sh-degree 1 --min-opacity 0.1 --lossy"
@@ -122,7 +126,13 @@ Gsdmsr = Any  # the fixture of conftest.py
                 {"axes": "y-up", "scale": 2, "sh_degree": 1, "min_opacity": 0.1, "lossy": True},
                 [],
                 Path("o"),
+                None,
             ),
+        ),
+        (
+            "export r --format moving --loss 0.2 --data d --out o",
+            "export",
+            (Path("r"), "moving", {"loss": 0.2}, [], Path("o"), Path("d")),
         ),
         ("demo", "demo", (Path("gsdmsr-demo"),)),
         ("doctor --json", "doctor", ()),
@@ -202,10 +212,10 @@ def test_commands_get_typed_arguments(
 
 
 def test_every_exporter_is_offered(gsdmsr: Gsdmsr) -> None:
-    assert {"compact", "ply", "ply-sequence"} <= set(format_names())
+    assert {"compact", "html", "moving", "ply", "ply-sequence"} <= set(format_names())
     for name in format_names():
         assert gsdmsr(f"export r --format {name} --out o") == 0
-        assert gsdmsr.calls[-1] == ("export", (Path("r"), name, {}, [], Path("o")))
+        assert gsdmsr.calls[-1] == ("export", (Path("r"), name, {}, [], Path("o"), None))
 
 
 def overrides_of(gsdmsr: Gsdmsr, options: str) -> tuple[str, ...]:
