@@ -408,6 +408,11 @@ def test_every_subcommand_has_a_page_that_names_its_options(command: str) -> Non
         known |= {
             name for c in ("train", "render") for p in group.commands[c].params for name in p.opts
         }
-    if command not in ("eval", "demo", "presets", "view"):  # these name options of other commands too
+    if command not in (
+        "eval",
+        "demo",
+        "presets",
+        "view",
+    ):  # these name options of other commands too
         unknown = set(re.findall(r"(?<![\w-])--[a-z][a-z-]*", text)) - known
         assert not unknown - {"--data", "--preset"}, unknown
