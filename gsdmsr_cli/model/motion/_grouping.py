@@ -129,13 +129,19 @@ def settle(
         total = torch.zeros_like(before.means)
         for after in then:
             movements = fit_movements(before, after, group, weights, anchors)
-            ways, turns, _ = movements.split(PARTS, 1)
-            matrices = quat_to_rotmat(turns + _identity(turns))[group]
-            arms = after.means - (anchors + ways)[group]
-            total += (matrices.mT @ arms[:, :, None])[:, :, 0] + anchors[group]
+            total += take_back(after.means, movements, group, anchors)
         before = replace(before, means=total / len(then))
     scales = torch.stack([after.log_scales.exp() for after in then]).mean(dim=0)
     return replace(before, log_scales=scales.log())
+
+
+def take_back(means: Tensor, movements: Tensor, group: Tensor, anchors: Tensor) -> Tensor:
+    """Return the places (N, 3) that movements (J, 10) of their groups take to ``means``."""
+    ways, turns, _ = movements.split(PARTS, 1)
+    matrices = quat_to_rotmat(turns + _identity(turns))[group]
+    arms = means - (anchors + ways)[group]
+    places: Tensor = (matrices.mT @ arms[:, :, None])[:, :, 0] + anchors[group]
+    return places
 
 
 def align(keys: Tensor, start: int) -> Tensor:

@@ -3,7 +3,8 @@
 GroupFlow of SpeeDe3DGS (Tu et al., CVPR 2026, section 3.3). Moving splats then costs next to
 nothing: no grid or network is asked. Groups are learnt from a motion that can do more, the base: it
 is trained first, and the event ``distil`` lets groups take over. Without a base they are learnt
-from the start, as neighbourhoods.
+from the start, as neighbourhoods. Beyond the paper, a splat may do more than its group: it moves in
+the group's frame, and grows, by the sum of a few series over time that all splats share.
 """
 
 from __future__ import annotations
@@ -19,15 +20,14 @@ from gsdmsr_cli.gaussians.moment import Moment
 from gsdmsr_cli.gaussians.splats import Splats
 from gsdmsr_cli.model.layer import Facts, Following, Instant, options_of
 from gsdmsr_cli.model.motion import _grouping as grouping
+from gsdmsr_cli.model.motion._distilled import OWN, add_own, learn_groups, learn_series
 from gsdmsr_cli.model.motion._grids import time_nodes
+from gsdmsr_cli.model.motion._shared_series import sum_series
 from gsdmsr_cli.model.motion._taking_over import PACKAGE, TakingOver
 from gsdmsr_cli.model.parameter import Parameter
 from gsdmsr_cli.ops import skin
 from gsdmsr_cli.ops.displace import OUTPUTS
 from gsdmsr_cli.options.strict import require
-
-MOMENTS = 8
-"""Times, evenly spaced, at which trajectories are compared."""
 
 OPAQUE = 0.1
 """Splats of this opacity or more may be anchors."""
@@ -38,16 +38,19 @@ class Options:
     """Settings.
 
     Attributes:
-        count: number of groups; 2048 in the paper.
+        count: number of groups; 2048 in the paper. Of a base there are never more than splats.
+        series: number of series that splats have shares of beyond their group; 0, as in the paper,
+            has none. They are learnt from the base.
         time_ratio: keyframes per distinct train time; 8 keyframes at least.
         smoothness: weight of the mean squared second difference of keyframes.
-        rate: learning rate of the keyframes, at the start and at the end; with a higher one they
-            learn the train views by heart.
+        rate: learning rate of keyframes and shares, at the start and at the end; with a higher one
+            they learn the train views by heart.
         base: name and options of the motion that learns first, until the event ``distil``; null
             learns groups from the start.
     """
 
     count: int = 512
+    series: int = 0
     time_ratio: float = 1.0
     smoothness: float = 0.0
     rate: tuple[float, float] = (1e-4, 1e-5)
@@ -55,6 +58,9 @@ class Options:
 
     def __post_init__(self) -> None:
         require(self, "count", self.count >= 1, "1 or more")
+        require(self, "series", self.series >= 0, "0 or more")
+        if self.base is None:
+            require(self, "series", not self.series, "0, unless there is a base")
         require(self, "time_ratio", self.time_ratio > 0, "a number above 0")
         require(self, "smoothness", self.smoothness >= 0, "0 or more")
         require(self, "rate", min(self.rate) > 0, "[start, end], both above 0")
@@ -75,11 +81,16 @@ class RigidGroups(TakingOver):
         count, times = options.count, time_nodes(facts.frames, options.time_ratio)
         self.anchors, self.keys = torch.zeros(count, 3), torch.zeros(times, count, OUTPUTS)
         self.group = torch.zeros(len(splats), 1, dtype=torch.int32)
+        self.series = torch.zeros(times, options.series)
+        self.shares = torch.zeros(len(splats), options.series, OWN)
         own = [
             Parameter("anchors", self.anchors),
             Parameter("keys", self.keys, rate=options.rate),
             Parameter("group", self.group, per_splat=True),
         ]
+        if options.series:
+            own.append(Parameter("series", self.series))
+            own.append(Parameter("shares", self.shares, per_splat=True, rate=options.rate))
         super().__init__(own, options.base, facts, splats, generator)
         if self.base is None:
             self._place(splats)
@@ -91,17 +102,19 @@ class RigidGroups(TakingOver):
         return [replace(moment, splats=self._moved(moment.splats, i.time)) for i in instants]
 
     def following(self) -> Following | None:
-        """Return the groups, once they have taken over."""
+        """Return the groups, once they have taken over, unless splats do more than follow them."""
         if not self.active:
             return None if self.base is None else self.base.following()
+        if self.options.series:
+            return None
         return Following(self.anchors, None, self.group[:, 0].long(), self._movements)
 
     def _movements(self, time: float) -> Tensor:
-        place = min(max(time, 0.0), 1.0) * (len(self.keys) - 1)
-        before = min(int(place), len(self.keys) - 2)
-        return torch.lerp(self.keys[before], self.keys[before + 1], place - before)
+        return _between(self.keys, time)
 
     def _moved(self, splats: Splats, time: float) -> Splats:
+        if self.options.series:
+            splats = add_own(splats, sum_series(_between(self.series, time), self.shares))
         transforms = skin.transforms(self.anchors, self._movements(time))
         radii = self.anchors.new_zeros(len(self.anchors))  # one point alone has all the weight
         return skin.skin(splats, self.anchors, radii, transforms, self.group)
@@ -112,27 +125,21 @@ class RigidGroups(TakingOver):
 
         The canonical splats become those of half time, moved to where they fit all times best.
         """
-        base, last = self.base, len(self.keys) - 1
+        base, o = self.base, self.options
         if base is None or self.active:
             return splats, ()
 
         def at(time: float) -> Splats:
             return base.at(Moment(splats), Instant(time)).splats.detach()
 
-        before, then = at(0.5), [at(i / (MOMENTS - 1)) for i in range(MOMENTS)]
-        chosen = grouping.spread_rows(then[0].means, _opaque(splats), len(self.anchors))
-        self.anchors.copy_(before.means[chosen])
-        paths, kept = torch.stack([one.means for one in then]), min(grouping.NEAREST, len(chosen))
-        near = grouping.group_paths(paths, chosen, kept)
-        shown = before.logit_opacities.sigmoid(), self.anchors
-        group = grouping.group_splats(before, then, near, *shown)
-        self.group.copy_(group[:, None])
-        before = grouping.settle(before, then, group, *shown)
-        keys = [
-            grouping.fit_movements(before, at(i / last), group, *shown) for i in range(last + 1)
-        ]
-        self.keys.copy_(grouping.align(torch.stack(keys), last // 2))
-        return before, self.take_over(len(splats))
+        groups = learn_groups(at, _opaque(splats), o.count, len(self.keys))
+        learnt = {"anchors": groups.anchors, "keys": groups.keys, "group": groups.group[:, None]}
+        settled = groups.splats
+        if o.series:
+            settled, learnt["series"], learnt["shares"] = learn_series(at, groups, o.series)
+        for parameter in self._own:
+            parameter.set_values(learnt[parameter.name].to(parameter.tensor.dtype))
+        return settled, self.take_over(len(splats))
 
     @torch.no_grad()
     def _place(self, splats: Splats) -> None:
@@ -169,8 +176,18 @@ class RigidGroups(TakingOver):
             raise ValueError(f"anchors and keyframes of shapes {shapes}")
         if not count or times < 2:
             raise ValueError(f"{count} groups and {times} keyframes")
+        if self.series.shape[0] != times or self.shares.shape[1:] != (self.series.shape[1], OWN):
+            shapes = tuple(self.series.shape), tuple(self.shares.shape)
+            raise ValueError(f"series and shares of shapes {shapes} for {times} keyframes")
         if self.group.shape[1] != 1 or ((self.group < 0) | (self.group >= count)).any():
             raise ValueError(f"splats of other groups than there are, {count}")
+
+
+def _between(values: Tensor, time: float) -> Tensor:
+    """Return what values (T, ...) of evenly spaced times are at a time in [0, 1]."""
+    place = min(max(time, 0.0), 1.0) * (len(values) - 1)
+    before = min(int(place), len(values) - 2)
+    return torch.lerp(values[before], values[before + 1], place - before)
 
 
 def _opaque(splats: Splats) -> Tensor:

@@ -154,14 +154,28 @@ def test_a_full_turn_goes_on_smoothly_between_keyframes() -> None:
     torch.testing.assert_close(align(flipped, 8), keys)
 
 
-def distilled(count: int = 60) -> tuple[RigidGroups, Splats]:
+class Swaying(Bodies):
+    """A base that has also learnt how splats sway and swell, each by its own amount."""
+
+    def at(self, moment: Moment, instant: Instant) -> Moment:
+        splats, rng = super().at(moment, instant).splats, generator(8)
+        phase = 2 * math.pi * instant.time
+        sway, swell = (0.1 * torch.randn(splats.means.shape, generator=rng) for _ in range(2))
+        means, log_scales = splats.means.clone(), splats.log_scales + 5 * swell * math.cos(phase)
+        means += sway * splats.log_scales.exp() * math.sin(phase)
+        return replace(moment, splats=replace(splats, means=means, log_scales=log_scales))
+
+
+def distilled(
+    splats: int = 60, base: Layer | None = None, /, **options: int
+) -> tuple[RigidGroups, Splats]:
     """Return groups that have taken over from two bodies, and their canonical splats."""
-    settings = {"count": 6, "base": {"name": "multiscale"}}
-    motion = cast(RigidGroups, started("rigid_groups", count, **settings))
-    motion.base, base = Bodies(), motion.base
-    splats, dropped = motion.distil(two_bodies(count))
+    settings = {"count": 6, "base": {"name": "multiscale"}} | options
+    motion = cast(RigidGroups, started("rigid_groups", splats, **settings))
+    motion.base, base = base or Bodies(), motion.base
+    settled, dropped = motion.distil(two_bodies(splats))
     assert base is not None and set(dropped) == {f"base.{name}" for name in base.tensors()}
-    return motion, splats
+    return motion, settled
 
 
 def test_groups_move_as_the_motion_does_that_they_take_over_from() -> None:
@@ -174,6 +188,77 @@ def test_groups_move_as_the_motion_does_that_they_take_over_from() -> None:
         same_shape(moved_by(motion, splats, time), truth(two_bodies(60), time), tolerance)
 
 
+def test_series_say_what_groups_leave() -> None:
+    """What is the same for all splats but for its amount takes as many series as there are such."""
+    truths = {time: moved_by(Swaying(), two_bodies(60), time) for time in (0.0, 0.15, 0.5)}
+
+    def error(series: int) -> float:
+        motion, splats = distilled(60, Swaying(), series=series)
+        off = 0.0
+        for time, expected in truths.items():
+            found = moved_by(motion, splats, time).detach()
+            size = expected.log_scales.exp().mean(dim=1, keepdim=True)
+            off += float(((found.means - expected.means) / size).square().mean())
+            off += float((found.log_scales - expected.log_scales).square().mean())
+        return off
+
+    assert error(8) < 1e-2 * error(0)
+
+
+def test_splats_that_do_more_than_their_groups_do_not_follow_them_alone() -> None:
+    assert distilled()[0].following() is not None
+    assert distilled(60, Swaying(), series=3)[0].following() is None
+
+
+def in_double(motion: RigidGroups) -> RigidGroups:
+    """Return the motion with numbers of 64 bits, which plain torch serves."""
+    for parameter in motion.parameters():
+        if parameter.tensor.dtype == torch.float32:
+            parameter.set_values(parameter.tensor.double())
+    return motion
+
+
+def test_what_a_splat_does_of_its_own_goes_with_its_group() -> None:
+    """In numbers of 64 bits, against products; and its gradients."""
+    motion, splats = distilled(7, Swaying(), series=3)
+    motion, splats = in_double(motion), splats.map(Tensor.double)
+    place = 0.33 * (len(motion.keys) - 1)
+    keys, row = (
+        (1 - place % 1) * tensor[int(place)] + place % 1 * tensor[int(place) + 1]
+        for tensor in (motion.keys, motion.series)
+    )
+    own = torch.einsum("k,nkc->nc", row, motion.shares)
+    means, log_scales = splats.means + own[:, :3], splats.log_scales + own[:, 3:]
+    before = replace(splats, means=means, log_scales=log_scales)
+    expected = moved(before, motion.anchors, keys, motion.group[:, 0].long())
+    found = moved_by(motion, splats, 0.33)
+    for name, tensor in expected.tensors().items():
+        torch.testing.assert_close(found.tensors()[name], tensor, rtol=1e-9, atol=1e-12)
+
+    def shown(shares: Tensor) -> tuple[Tensor, ...]:
+        motion.shares = shares
+        after = moved_by(motion, splats, 0.33)
+        return after.means, after.log_scales
+
+    assert torch.autograd.gradcheck(shown, motion.shares.detach().clone().requires_grad_())
+
+
+def test_shares_follow_their_splats() -> None:
+    motion, splats = distilled(60, Swaying(), series=3)
+    rows = torch.tensor([8, 8, 59, 0])
+    expected = moved_by(motion, splats, 0.7).take(rows)
+    motion.take(rows, torch.tensor([False, True, False, False]))
+    found = moved_by(motion, splats.take(rows), 0.7)
+    assert torch.equal(found.means, expected.means)
+    assert torch.equal(found.log_scales, expected.log_scales)
+
+
+def test_there_are_no_more_groups_than_splats() -> None:
+    motion, splats = distilled(9, count=50)
+    assert len(motion.anchors) == motion.keys.shape[1] == 9
+    same_shape(moved_by(motion, splats, 1.0), truth(two_bodies(9), 1.0), 1e-5)
+
+
 def test_what_has_been_taken_over_from_leaves_nothing() -> None:
     motion, _ = distilled()
     base = {n: t for n, t in motion.tensors().items() if n.startswith("base.")}
@@ -183,11 +268,13 @@ def test_what_has_been_taken_over_from_leaves_nothing() -> None:
     assert len(motion.tensors()["base.embeddings"]) == len(motion.group) == 3
 
 
-def test_groups_that_have_taken_over_are_restored() -> None:
-    motion, splats = distilled()
+@pytest.mark.parametrize("series", [0, 2])
+def test_groups_that_have_taken_over_are_restored(series: int) -> None:
+    motion, splats = distilled(60, Swaying(), series=series)
     model = model_of(splats, motion)
     tensors = {name: tensor.detach().clone() for name, tensor in model.tensors().items()}
-    settings = {"name": "rigid_groups", "count": 9, "base": {"name": "multiscale"}}
+    base = {"name": "multiscale"}
+    settings = {"name": "rigid_groups", "count": 9, "series": series, "base": base}
     loaded = load_model(tensors, settings, (), FACTS, 1.0)
     found, expected = (one.at(one.instant(0.3)).splats for one in (loaded, model))
     for name, tensor in expected.tensors().items():
@@ -196,6 +283,9 @@ def test_groups_that_have_taken_over_are_restored() -> None:
         load_model(tensors | {"motion.group": tensors["motion.group"] + 6}, settings, (), FACTS, 1)
     with pytest.raises(DataError, match="anchors and keyframes of shapes"):
         load_model(tensors | {"motion.anchors": torch.zeros(5, 3)}, settings, (), FACTS, 1)
+    if series:
+        with pytest.raises(DataError, match=r"series and shares of shapes .* for 20 keyframes"):
+            load_model(tensors | {"motion.series": torch.zeros(20, 3)}, settings, (), FACTS, 1)
 
 
 def test_until_then_the_base_is_the_motion() -> None:
@@ -246,6 +336,8 @@ def test_smoothness_is_the_mean_squared_second_difference() -> None:
     ("options", "message"),
     [
         ({"count": 0}, "count is 0; allowed: 1 or more"),
+        ({"series": -1}, "series is -1; allowed: 0 or more"),
+        ({"series": 2}, "series is 2; allowed: 0, unless there is a base"),
         ({"time_ratio": 0}, "time_ratio is 0.0; allowed: a number above 0"),
         ({"smoothness": -1}, "smoothness is -1.0; allowed: 0 or more"),
         ({"rate": [1e-3, 0]}, r"rate is .*; allowed: \[start, end\], both above 0"),

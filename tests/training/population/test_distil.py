@@ -14,7 +14,7 @@ from gsdmsr_cli.training.population import Tick
 from gsdmsr_cli.training.population.distil import Distil, Options
 from gsdmsr_cli.training.trainer import check_plugins
 
-MOTION = "motion={name: rigid_groups, count: 12, base: {name: multiscale}}"
+MOTION = "motion={name: rigid_groups, count: 12, series: 3, base: {name: multiscale}}"
 EVENTS = "events=[density, opacity_reset, {name: distil, at: 0.4}]"
 
 
@@ -25,7 +25,7 @@ def test_it_trains_with_workers_without_and_resumed(tiny_scene: Path, tmp_path: 
     assert tensors["motion.taken_over"] == 1 and tensors["motion.keys"].any()
     assert not any(t.numel() for n, t in tensors.items() if n.startswith("motion.base."))
     assert not any(n.startswith("adam.first.motion.base.") for n in tensors)
-    assert len(tensors["motion.group"]) == 200  # it has grown
+    assert len(tensors["motion.group"]) == len(tensors["motion.shares"]) == 200  # it has grown
     assert trainer.checkpoint().state["events"]["distil"] == {"done": True}
 
 
@@ -73,10 +73,11 @@ def test_what_cannot_be_is_refused_before_a_training(options: tuple[str], messag
         check_plugins(preset_of(*options))
 
 
-def test_more_groups_than_splats_leave_groups_empty(tiny_scene: Path) -> None:
+def test_of_more_groups_than_splats_as_many_are_left(tiny_scene: Path, tmp_path: Path) -> None:
     """As in the warm-up before a training, which has a handful of splats."""
-    trainer = trainer_of(tiny_scene, preset_of(MOTION.replace("12", "300"), EVENTS))
-    for _ in range(STEPS):
-        trainer.step()
-    splats = trainer.model.at(trainer.model.instant(0.3)).splats
-    assert len(splats) == 200 and splats.means.isfinite().all()
+    many = MOTION.replace("12", "3000")
+    trainer = assert_trains_the_same_in_all_ways(tiny_scene, tmp_path, many, EVENTS)
+    tensors = trainer.checkpoint().tensors
+    groups = len(tensors["motion.anchors"])
+    assert 64 < groups <= len(tensors["splats.means"])
+    assert tensors["motion.keys"].shape[1] == tensors["adam.first.motion.keys"].shape[1] == groups
