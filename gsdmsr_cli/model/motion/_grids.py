@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import torch
 from torch import Tensor
 
 
@@ -15,3 +16,10 @@ def split_times(rows: Tensor, count: int) -> Sequence[Tensor]:
 def time_nodes(frames: int, cells_per_frame: float, least: int = 8) -> int:
     """Return the nodes of a time grid for so many distinct times, ``least`` or more."""
     return max(round(frames * cells_per_frame), least)
+
+
+def between(values: Tensor, time: float) -> Tensor:
+    """Return what values (T, ...) of evenly spaced times are at a time in [0, 1]."""
+    place = min(max(time, 0.0), 1.0) * (len(values) - 1)
+    before = min(int(place), len(values) - 2)
+    return torch.lerp(values[before], values[before + 1], place - before)

@@ -21,7 +21,7 @@ from gsdmsr_cli.gaussians.splats import Splats
 from gsdmsr_cli.model.layer import Facts, Following, Instant, options_of
 from gsdmsr_cli.model.motion import _grouping as grouping
 from gsdmsr_cli.model.motion._distilled import OWN, add_own, learn_groups, learn_series
-from gsdmsr_cli.model.motion._grids import time_nodes
+from gsdmsr_cli.model.motion._grids import between, time_nodes
 from gsdmsr_cli.model.motion._shared_series import sum_series
 from gsdmsr_cli.model.motion._taking_over import PACKAGE, TakingOver
 from gsdmsr_cli.model.parameter import Parameter
@@ -107,15 +107,13 @@ class RigidGroups(TakingOver):
             return None if self.base is None else self.base.following()
         if self.options.series:
             return None
-        return Following(self.anchors, None, self.group[:, 0].long(), self._movements)
-
-    def _movements(self, time: float) -> Tensor:
-        return _between(self.keys, time)
+        group = self.group[:, 0].long()
+        return Following(self.anchors, None, group, lambda time: between(self.keys, time))
 
     def _moved(self, splats: Splats, time: float) -> Splats:
         if self.options.series:
-            splats = add_own(splats, sum_series(_between(self.series, time), self.shares))
-        transforms = skin.transforms(self.anchors, self._movements(time))
+            splats = add_own(splats, sum_series(between(self.series, time), self.shares))
+        transforms = skin.transforms(self.anchors, between(self.keys, time))
         radii = self.anchors.new_zeros(len(self.anchors))  # one point alone has all the weight
         return skin.skin(splats, self.anchors, radii, transforms, self.group)
 
@@ -181,13 +179,6 @@ class RigidGroups(TakingOver):
             raise ValueError(f"series and shares of shapes {shapes} for {times} keyframes")
         if self.group.shape[1] != 1 or ((self.group < 0) | (self.group >= count)).any():
             raise ValueError(f"splats of other groups than there are, {count}")
-
-
-def _between(values: Tensor, time: float) -> Tensor:
-    """Return what values (T, ...) of evenly spaced times are at a time in [0, 1]."""
-    place = min(max(time, 0.0), 1.0) * (len(values) - 1)
-    before = min(int(place), len(values) - 2)
-    return torch.lerp(values[before], values[before + 1], place - before)
 
 
 def _opaque(splats: Splats) -> Tensor:
