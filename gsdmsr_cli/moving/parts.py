@@ -16,6 +16,9 @@ Floats = NDArray[np.float64]
 MOST_BYTES = 6
 """Of an integer: a browser's numbers hold 53 bits exactly."""
 
+MOST_INFLATED, MOST_HELD = 1100, 1 << 30
+"""No zlib stream holds more than so many times its bytes; and no part more than so many bytes."""
+
 LEVEL = 9
 """Of zlib: the file is written once and fetched often."""
 
@@ -157,6 +160,8 @@ def integers_of(part: Part) -> Integers:
         ValueError: the stream is damaged, or not of this length.
     """
     wanted = part.rows * part.columns * part.width
+    if wanted > MOST_INFLATED * (len(part.stream) + 1) or wanted > MOST_HELD:
+        raise ValueError(f"part '{part.name}' cannot hold {wanted} bytes")
     inflater = zlib.decompressobj()
     try:
         data = inflater.decompress(part.stream, wanted + 1)  # a bomb is not inflated

@@ -210,6 +210,21 @@ def safetensors(*seeds: bytes) -> Mutation:
     return mutate
 
 
+def headed(*seeds: bytes) -> Mutation:
+    """Return what changes the header of a file of moving splats, or its bytes."""
+    on_bytes = raw(*seeds)
+
+    def mutate(random: Random) -> bytes:
+        if random.random() < 0.4:
+            return on_bytes(random)
+        data = random.choice(seeds)
+        (length,) = struct.unpack_from("<I", data, 12)
+        text = document(data[16 : 16 + length])(random)
+        return data[:12] + struct.pack("<I", len(text)) + text + data[16 + length :]
+
+    return mutate
+
+
 def _flip(random: Random, data: bytearray, seeds: Any) -> bytearray:
     if data:
         data[random.randrange(len(data))] ^= 1 << random.randrange(8)

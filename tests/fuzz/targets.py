@@ -36,8 +36,10 @@ from gsdmsr_cli.formats import _points, read_scene
 from gsdmsr_cli.gaussians.splats import Splats
 from gsdmsr_cli.model.building import start_model
 from gsdmsr_cli.model.layer import Facts
+from gsdmsr_cli.moving.quick import quick_file
 from gsdmsr_cli.options.preset import load_preset
 from gsdmsr_cli.paths import _keyframes
+from gsdmsr_cli.runs import moving_file
 from gsdmsr_cli.runs.checkpoints import Checkpoint
 from gsdmsr_cli.runs.run import create_run, open_run
 from gsdmsr_cli.scene import imaging
@@ -361,16 +363,33 @@ def _runs(folder: Path) -> list[Target]:
     def load(path: Path) -> None:
         open_run(path.parent).load_model()
 
+    described = folder / "a.dsplat"
+    header = {"scene": {}, "about": run.about() | {"step": 10, "progress": 0.1}}
+    described.write_bytes(quick_file(model, 2, facts.bound, header))
+
+    def play(path: Path) -> None:
+        open_run(path)
+        played, _ = moving_file.load(path)
+        played.at(played.instant(0.3))
+
     files = {
         "run.json": (mutations.document, lambda path: open_run(path.parent), 0.8),
         "checkpoint.safetensors": (mutations.safetensors, load, 0.3),
         "metrics.jsonl": (mutations.words, read_log, 0.5),
     }
+    moving = mutations.headed(described.read_bytes())
     return [
-        Target(
-            f"run: {name}", run.root / name, mutate((run.root / name).read_bytes()), read, weight
-        )
-        for name, (mutate, read, weight) in files.items()
+        Target("run: .dsplat", described, moving, play, 2),
+        *(
+            Target(
+                f"run: {name}",
+                run.root / name,
+                mutate((run.root / name).read_bytes()),
+                read,
+                weight,
+            )
+            for name, (mutate, read, weight) in files.items()
+        ),
     ]
 
 
