@@ -41,7 +41,9 @@ def render(
     output: Annotated[
         str, typer.Option(metavar="A,B", help="Any of rgb, depth, alpha, flow, error.")
     ] = "rgb",
-    video: Annotated[str, typer.Option(metavar="A,B", help="webm, mp4, or none.")] = "webm",
+    video: Annotated[
+        str, typer.Option(metavar="A,B", help="Any of webm, mp4, webp; or none.")
+    ] = "webm",
     size: Annotated[
         str | None, typer.Option(metavar="WxH", help="Size of the pictures [px].")
     ] = None,

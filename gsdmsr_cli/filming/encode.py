@@ -1,4 +1,4 @@
-"""Encodes frames as videos: VP8 in WebM and H.264 in MP4, by the encoders that PyAV brings."""
+"""Encodes frames as videos: VP8 in WebM, H.264 in MP4 and animated WebP, by PyAV's encoders."""
 
 from __future__ import annotations
 
@@ -28,6 +28,7 @@ class Encoding:
         options: of the encoder.
         muxing: options of the container.
         most_bits: limit of the rate [bit/s], or None for none.
+        pixels: FFmpeg's name of the layout of the pixels that the encoder is given.
         matrix: PyAV's name of what makes YUV of RGB.
     """
 
@@ -35,6 +36,7 @@ class Encoding:
     options: Mapping[str, str]
     muxing: Mapping[str, str] = field(default_factory=dict)
     most_bits: int | None = None
+    pixels: str = "yuv420p"
     matrix: str = "ITU601"
 
 
@@ -52,6 +54,13 @@ ENCODINGS = {
         },
         muxing={"movflags": "+faststart"},
         matrix="ITU709",
+    ),
+    # the encoder compares pictures as RGB and finds their YUV itself; 0 loops are without end
+    "webp": Encoding(
+        "libwebp_anim",
+        {"quality": "75", "compression_level": "4"},
+        muxing={"loop": "0"},
+        pixels="bgra",
     ),
 }  # fmt: skip
 """By the kind of video, which is also FFmpeg's name of the container."""
@@ -74,8 +83,8 @@ def require_encoder(kind: str) -> None:
 def write_video(kind: str, path: Path, frames: Iterable[Pixels], fps: float) -> None:
     """Write (H, W, 3) RGB frames as a video of a kind of ``ENCODINGS``, whole or not at all.
 
-    Colours are kept at half the resolution, which needs even sizes: an odd last row or column is
-    doubled.
+    Colours are kept at half the resolution. Videos other than WebP need even sizes for that: an odd
+    last row or column is doubled.
 
     Raises:
         UsageError: the PyAV that is installed has no encoder for it.
@@ -112,18 +121,19 @@ def _encode(
 ) -> None:
     frame_of = load_av().VideoFrame.from_ndarray
     height, width, _ = shape
-    odd = (0, height % 2), (0, width % 2), (0, 0)
+    halved = encoding.pixels == "yuv420p"
+    more = (height % 2, width % 2) if halved else (0, 0)
     rate = Fraction(fps).limit_denominator(1001)
     stream = container.add_stream(encoding.encoder, rate, options=dict(encoding.options))
-    stream.width, stream.height = width + width % 2, height + height % 2
-    stream.pix_fmt = "yuv420p"
+    stream.width, stream.height = width + more[1], height + more[0]
+    stream.pix_fmt = encoding.pixels
     if encoding.most_bits is not None:
         stream.bit_rate = encoding.most_bits
     for i, frame in enumerate(frames):
         if frame.shape != shape:
             raise ValueError(f"frame {i} has shape {frame.shape}, not {shape}")
-        even = np.pad(frame, odd, mode="edge") if height % 2 or width % 2 else frame
+        even = np.pad(frame, ((0, more[0]), (0, more[1]), (0, 0)), mode="edge")
         given = frame_of(np.ascontiguousarray(even), format="rgb24")
-        yuv = given.reformat(format="yuv420p", dst_colorspace=encoding.matrix)
-        container.mux(stream.encode(yuv))
+        laid_out = given.reformat(format=encoding.pixels, dst_colorspace=encoding.matrix)
+        container.mux(stream.encode(laid_out))
     container.mux(stream.encode())

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from gsdmsr_cli.ground.errors import UsageError, nearest
 
 OUTPUTS = ("rgb", "depth", "alpha", "flow", "error")
-VIDEOS = ("webm", "mp4")
+VIDEOS = ("webm", "mp4", "webp")
 MOST_PIXELS = 16384
 """Largest side of what is drawn [px]."""
 

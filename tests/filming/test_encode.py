@@ -9,6 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from PIL import Image, ImageSequence
 
 from gsdmsr_cli.filming.encode import ENCODINGS, require_encoder, write_video
 from gsdmsr_cli.filming.request import VIDEOS
@@ -16,7 +17,7 @@ from gsdmsr_cli.ground.errors import GsdmsrError, UsageError
 from gsdmsr_cli.scene.native import load_av
 
 COLOURS = [(220, 30, 30), (30, 200, 30), (40, 40, 210), (250, 250, 250)]
-BOTH = pytest.mark.parametrize("kind", ENCODINGS)
+EACH = pytest.mark.parametrize("kind", ENCODINGS)
 
 
 def plain(height: int, width: int) -> list[np.ndarray]:
@@ -24,7 +25,10 @@ def plain(height: int, width: int) -> list[np.ndarray]:
 
 
 def opened(path: Path) -> tuple[float, list[np.ndarray]]:
-    """Return the frames a second, and the frames in RGB, as OpenCV sees them."""
+    """Return the frames a second, and the frames in RGB, as OpenCV or Pillow sees them."""
+    if path.read_bytes()[8:12] == b"WEBP":
+        durations, frames = animation(path)
+        return 1000 * len(frames) / sum(durations), frames
     capture = cv2.VideoCapture(str(path))
     rate, frames = capture.get(cv2.CAP_PROP_FPS), []
     while (frame := capture.read()[1]) is not None:
@@ -32,11 +36,21 @@ def opened(path: Path) -> tuple[float, list[np.ndarray]]:
     return rate, frames
 
 
+def animation(path: Path) -> tuple[list[int], list[np.ndarray]]:
+    """Return how long [ms] the frames of an animated WebP last, and the frames in RGB."""
+    durations, frames = [], []
+    with Image.open(path) as picture:
+        for frame in ImageSequence.Iterator(picture):
+            frames.append(np.asarray(frame.convert("RGB")))
+            durations.append(int(frame.info["duration"]))
+    return durations, frames
+
+
 def test_every_kind_that_can_be_asked_for_has_an_encoding() -> None:
     assert tuple(ENCODINGS) == VIDEOS
 
 
-@BOTH
+@EACH
 @pytest.mark.parametrize(("height", "width"), [(32, 48), (33, 47), (9, 7), (2, 2)])
 def test_a_video_holds_every_frame_with_even_sides(
     tmp_path: Path, kind: str, height: int, width: int, capfd: pytest.CaptureFixture[str]
@@ -47,13 +61,14 @@ def test_a_video_holds_every_frame_with_even_sides(
     assert rate == pytest.approx(12.5)
     assert len(frames) == len(COLOURS)
     for frame, colour in zip(frames, COLOURS, strict=True):
-        assert frame.shape == (height + height % 2, width + width % 2, 3)
+        odd = (height % 2, width % 2) if kind != "webp" else (0, 0)
+        assert frame.shape == (height + odd[0], width + odd[1], 3)
         assert np.abs(frame.mean((0, 1)) - colour).max() < 8
     assert list(tmp_path.iterdir()) == [path]
     assert capfd.readouterr() == ("", "")
 
 
-@BOTH
+@EACH
 def test_a_moving_picture_is_kept_well(tmp_path: Path, kind: str) -> None:
     """A drifting pattern of strong colours, of which half the resolution is kept."""
     y, x = np.mgrid[:96, :128].astype(np.float64)
@@ -80,7 +95,19 @@ def test_an_mp4_says_which_colours_it_has_and_can_be_played_while_it_loads(tmp_p
     assert data.index(b"moov") < data.index(b"mdat")
 
 
-@BOTH
+def test_an_animated_picture_loops_for_ever_at_its_rate(tmp_path: Path) -> None:
+    """A frame lasts whole milliseconds, and 30 of them last a second all the same."""
+    films = [np.full((16, 16, 3), 8 * i, np.uint8) for i in range(30)]
+    write_video("webp", tmp_path / "a.webp", films, 30)
+    durations, frames = animation(tmp_path / "a.webp")
+    assert set(durations) == {33, 34} and 999 <= sum(durations) <= 1000
+    for frame, true in zip(frames, films, strict=True):
+        assert np.abs(frame.astype(int) - true).max() <= 3
+    with Image.open(tmp_path / "a.webp") as picture:
+        assert picture.info["loop"] == 0  # which is without end
+
+
+@EACH
 def test_videos_need_frames_of_one_size(tmp_path: Path, kind: str) -> None:
     with pytest.raises(GsdmsrError, match="at least one frame"):
         write_video(kind, tmp_path / "a", [], 24)
@@ -89,7 +116,7 @@ def test_videos_need_frames_of_one_size(tmp_path: Path, kind: str) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-@BOTH
+@EACH
 def test_an_interruption_leaves_nothing_behind(tmp_path: Path, kind: str) -> None:
     def frames():
         yield from plain(32, 48)
@@ -100,15 +127,17 @@ def test_an_interruption_leaves_nothing_behind(tmp_path: Path, kind: str) -> Non
     assert list(tmp_path.iterdir()) == []
 
 
-def test_what_the_encoder_refuses_is_told_in_its_words(tmp_path: Path) -> None:
-    huge = np.zeros((2, 20000, 3), np.uint8)  # VP8 has 14 bits for a side
-    with pytest.raises(GsdmsrError, match=r"libvpx cannot encode 20000 x 2 px.*--size") as caught:
-        write_video("webm", tmp_path / "a.webm", [huge], 24)
+@pytest.mark.parametrize("kind", ["webm", "webp"])
+def test_what_the_encoder_refuses_is_told_in_its_words(tmp_path: Path, kind: str) -> None:
+    huge = np.zeros((2, 20000, 3), np.uint8)  # VP8 and WebP have 14 bits for a side
+    words = rf"{ENCODINGS[kind].encoder} cannot encode 20000 x 2 px.*--size"
+    with pytest.raises(GsdmsrError, match=words) as caught:
+        write_video(kind, tmp_path / f"a.{kind}", [huge], 24)
     assert "\n" not in str(caught.value)
     assert list(tmp_path.iterdir()) == []
 
 
-@BOTH
+@EACH
 def test_an_encoder_that_is_not_there_is_told(
     tmp_path: Path, kind: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -121,7 +150,7 @@ def test_an_encoder_that_is_not_there_is_told(
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="needs a limit on the size of files")
-@BOTH
+@EACH
 def test_a_video_that_does_not_fit_on_the_disk_is_refused(tmp_path: Path, kind: str) -> None:
     program = f"""
 import resource, signal
