@@ -21,10 +21,12 @@ COLUMNS = {
     "ssim": ".4f",
     "lpips_alex": ".4f",
     "fps": ".0f",
+    "fps_raster": ".0f",
     "model_mb": ".2f",
     "splats": ".0f",
     "steps": ".0f",
     "ms_per_step": ".1f",
+    "peak_mib": ".0f",
 }
 """The measured columns and how they are written; all but the spread are means over seeds."""
 
@@ -63,11 +65,12 @@ def _values(document: Mapping[str, Any]) -> dict[str, float | None]:
         **{f"{split}_psnr": splits.get(split, {}).get("psnr") for split in SPLITS},
         "ssim": aggregate["ssim"],
         "lpips_alex": aggregate["lpips_alex"]["value"],
-        "fps": document["speed"]["fps"],
+        **{name: document["speed"][name] for name in ("fps", "fps_raster")},
         "model_mb": (storage["splats_bytes"] + storage["motion_bytes"]) / 1e6,
         "splats": training["splats"],
         "steps": training["steps"],
         "ms_per_step": 1e3 * training["train_s"] / training["steps"],
+        "peak_mib": training.get("peak_rss_mib"),
     }
 
 

@@ -19,9 +19,9 @@ def document(psnr: float | None, lpips: float | None = 0.25) -> dict[str, Any]:
     return {
         "aggregate": {"psnr": psnr, "ssim": 0.5, "lpips_alex": {"value": lpips}},
         "splits": {"test": {"psnr": psnr}, "train": {"psnr": 40.0}},
-        "speed": {"fps": 100.0},
+        "speed": {"fps": 100.0, "fps_raster": 150.0},
         "storage": {"splats_bytes": 2_000_000, "motion_bytes": 500_000, "training_state_bytes": 7},
-        "training": {"splats": 10, "steps": 200, "train_s": 5.0},
+        "training": {"splats": 10, "steps": 200, "train_s": 5.0, "peak_rss_mib": 300.0},
     }
 
 
@@ -30,8 +30,9 @@ def test_a_single_trial() -> None:
     assert row == {
         "scene": "lego", "preset": "dnerf", "length": "2m", "trials": 1, "psnr": 30.0,
         "spread": None, "train_psnr": 40.0, "val_psnr": None, "test_psnr": 30.0, "ssim": 0.5,
-        "lpips_alex": 0.25, "fps": 100.0,
+        "lpips_alex": 0.25, "fps": 100.0, "fps_raster": 150.0,
         "model_mb": 2.5, "splats": 10, "steps": 200, "ms_per_step": 25.0,
+        "peak_mib": 300.0,
     }  # fmt: skip
 
 
