@@ -14,7 +14,7 @@ from typing import Any
 VARIABLE = "GSDMSR_CHROMIUM"
 NAMES = ("chromium", "chromium-browser", "google-chrome", "chrome", "chrome-headless-shell")
 
-PATIENCE = 60.0
+PATIENCE = 120.0
 """Longest silence of the browser [s]."""
 
 OPTIONS = (

@@ -64,34 +64,34 @@ function parseHeader(bytes) {
 
 const isCount = (value, most = MOST_ROWS) => Number.isInteger(value) && value >= 0 && value <= most;
 
-function require(holds, what) {
+function demand(holds, what) {
   if (!holds) throw new FileError(`The file is damaged: ${what}.`);
 }
 
 function checkHeader(header) {
-  require(header !== null && typeof header === "object", "its header is no object");
+  demand(header !== null && typeof header === "object", "its header is no object");
   const { splats, moving, sh_degree: degree, times, bodies, parts } = header;
-  require(isCount(splats) && isCount(moving, splats), "its numbers of splats are not possible");
-  require(isCount(degree, 3), "sh_degree is not 0 to 3");
-  require(isCount(times) && times >= 1, "times is not 1 or more");
+  demand(isCount(splats) && isCount(moving, splats), "its numbers of splats are not possible");
+  demand(isCount(degree, 3), "sh_degree is not 0 to 3");
+  demand(isCount(times) && times >= 1, "times is not 1 or more");
   if (bodies) {
     const { count, neighbours } = bodies;
-    require(isCount(count) && count >= 1 && isCount(neighbours, count), "bodies is not possible");
+    demand(isCount(count) && count >= 1 && isCount(neighbours, count), "bodies is not possible");
   }
-  require(Array.isArray(parts), "it has no list of parts");
+  demand(Array.isArray(parts), "it has no list of parts");
   for (const entry of parts) checkEntry(entry);
 }
 
 function checkEntry(entry) {
-  require(entry !== null && typeof entry?.name === "string", "a part has no name");
+  demand(entry !== null && typeof entry?.name === "string", "a part has no name");
   const { name, rows, columns, width, bytes } = entry;
-  require(isCount(rows) && isCount(columns, 1 << 20), `${name} has no size`);
-  require(isCount(width, 6) && width >= 1 && isCount(bytes, 2 ** 40), `${name} has no width`);
+  demand(isCount(rows) && isCount(columns, 1 << 20), `${name} has no size`);
+  demand(isCount(width, 6) && width >= 1 && isCount(bytes, 2 ** 40), `${name} has no width`);
   if (!isKnown(name)) return;
   for (const key of ["least", "step"]) {
     const given = entry[key] = [entry[key]].flat(); // one number may stand for all columns
     const enough = given.length === 1 || given.length === (name === "means" ? 3 : columns);
-    require(enough && given.every(Number.isFinite), `${name} has no values for ${key}`);
+    demand(enough && given.every(Number.isFinite), `${name} has no values for ${key}`);
   }
 }
 
@@ -110,7 +110,7 @@ async function inflate(bytes, { name, rows, columns, width }) {
   } catch {
     throw new FileError(`The file is damaged: ${name} cannot be unpacked.`);
   }
-  require(filled === planes.length, `${name} is shorter than it should be`);
+  demand(filled === planes.length, `${name} is shorter than it should be`);
   return planes;
 }
 
@@ -137,14 +137,14 @@ function readTable(planes, entry) {
     const factor = step[c % step.length];
     for (let i = 0; i < rows; i++) values[i * columns + c] = base + factor * column[i];
   }
-  require(values.every(Number.isFinite), `${entry.name} has values that are not finite`);
+  demand(values.every(Number.isFinite), `${entry.name} has values that are not finite`);
   return values;
 }
 
 /** Return the canonical centres, which are Morton codes in the file. */
 function readMeans(planes, entry, moving) {
   const { rows, columns, least, step, warp } = entry;
-  require(columns === 1, "means has more than one column");
+  demand(columns === 1, "means has more than one column");
   const column = new Float64Array(rows);
   readColumn(planes, entry, 0, column);
   const values = new Float32Array(rows * 3);
@@ -159,7 +159,7 @@ function readMeans(planes, entry, moving) {
       values[3 * i + axis] = warp === undefined ? p : warp * Math.sinh(p);
     }
   }
-  require(code < 2 ** 53 && values.every(Number.isFinite), "means has impossible places");
+  demand(code < 2 ** 53 && values.every(Number.isFinite), "means has impossible places");
   return values;
 }
 
@@ -204,18 +204,18 @@ function checkParts(header, parts) {
   }
   for (const [name, channels] of Object.entries(channelsOf(header))) {
     const curves = parts.get(`curves/${name}`);
-    require(Boolean(curves) === parts.has(`shares/${name}`), `${name} has curves or shares alone`);
+    demand(Boolean(curves) === parts.has(`shares/${name}`), `${name} has curves or shares alone`);
     if (!curves) continue;
-    require(bodies || !name.startsWith("body/"), `${name} is there without bodies`);
+    demand(bodies || !name.startsWith("body/"), `${name} is there without bodies`);
     expected[`curves/${name}`] = [header.times, curves.columns];
     const rows = name.startsWith("body/") ? bodies.count : m;
     expected[`shares/${name}`] = [rows, curves.columns * channels];
   }
   for (const [name, [rows, columns]] of Object.entries(expected)) {
     const part = parts.get(name);
-    require(part, `${name} is missing`);
-    require(part.rows === rows && part.columns === columns, `${name} has another size than it should`);
+    demand(part, `${name} is missing`);
+    demand(part.rows === rows && part.columns === columns, `${name} has another size than it should`);
   }
   const inside = (body) => body >= 0 && body < bodies.count && Number.isInteger(body);
-  require(!("body" in expected) || parts.get("body").values.every(inside), "body names no body");
+  demand(!("body" in expected) || parts.get("body").values.every(inside), "body names no body");
 }

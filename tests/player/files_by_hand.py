@@ -324,7 +324,7 @@ def with_everything() -> File:
 def many(count: int) -> File:
     """Return a scene of many small splats, all of which follow 4 of 512 bodies."""
     file, rng = still(count, 1, seed=9), np.random.default_rng(10)
-    file.tables["log_scales"] += np.log(0.1)
+    file.tables["log_scales"] += np.log(0.1) - np.log(count / 10_000) / 2  # cover as much together
     file.moving, file.times, file.bodies = count, 12, {"count": 512, "neighbours": 4}
     file.tables["points"] = rng.normal(size=(512, 3)) * 0.5
     file.tables["log_radii"] = np.full((512, 1), np.log(0.15))

@@ -83,9 +83,7 @@ def test_the_order_comes_by_itself_while_it_plays(browser: Chromium, tmp_path: P
 
 def test_the_sort_and_the_bodies_that_are_followed_are_exact(browser: Chromium) -> None:
     rng = np.random.default_rng(0)
-    depths = np.concatenate(
-        [rng.normal(size=3000) * 10.0 ** rng.integers(-6, 6, 3000), [0.0, -0.0]]
-    )
+    depths = np.concatenate([rng.normal(size=3000) * 10.0 ** rng.integers(-6, 6, 3000), [0.0]])
     depths = np.concatenate([depths, depths[:50]]).astype(np.float32)
     points, queries = rng.normal(size=(60, 3)), rng.normal(size=(500, 3)) * 2
     given = {"depths": depths.tolist(), "points": points.ravel().tolist(),
