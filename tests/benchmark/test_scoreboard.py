@@ -80,9 +80,11 @@ def test_the_table_has_a_line_for_every_row(count: int) -> None:
         "0.5000",
         "0.2500",
         "100",
+        "150",
         "2.50",
         "10",
         "200",
         "25.0",
+        "300",
     ]
     assert lines[2] == f"| {' | '.join(['s0', 'dnerf', '2m', *values])} |"
