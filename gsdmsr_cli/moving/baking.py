@@ -6,7 +6,7 @@ No layer has to know of this. One whose splats follow bodies, or live for a whil
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
@@ -21,20 +21,24 @@ from gsdmsr_cli.model.layer import Following, Instant
 from gsdmsr_cli.model.model import MOTION, Model
 from gsdmsr_cli.moving.baked import COLOURS, OF_BODIES, Baked, Bodies
 from gsdmsr_cli.moving.curves import Track, track_of
-from gsdmsr_cli.moving.playing import UNSEEN, Played, exponents_of
-from gsdmsr_cli.moving.shapes import rotations_and_scales, upright
+from gsdmsr_cli.moving.looking import (
+    Samples,
+    add,
+    at,
+    in_the_mean,
+    joined,
+    look,
+    stacked,
+    without_lives,
+)
+from gsdmsr_cli.moving.playing import Played
+from gsdmsr_cli.moving.shapes import upright
 
 MOST_TIMES = 256
 """At which a model is looked at; more of them are hardly ever seen apart."""
 
-FAINTEST = 1e-3
-"""Where a life leaves less of its opacity, it does not show how opaque the splat would be."""
-
 NOTHING = 1e-6
 """Tracks that nowhere differ by more from nothing are rounding."""
-
-Samples = Mapping[str, Tensor]
-"""Splats at T times: means, quats, log_scales, opacities and sh, (T, M, C) each."""
 
 
 @torch.no_grad()
@@ -53,10 +57,10 @@ def bake(model: Model, frames: int) -> Baked:
     count = min(max(frames, 2), MOST_TIMES) if moving else 1
     times = [i / max(count - 1, 1) for i in range(count)]
     lives, following = _lives(model, moving), _following(model)
-    samples, still = _look(model, times, moving)
-    samples = _without_lives(samples, lives, times)
-    splats = _canonical(model, moving) if following is not None else _in_the_mean(samples)
-    splats = _joined(splats, still)
+    samples, still = look(model, times, moving)
+    samples = without_lives(samples, lives, times)
+    splats = _canonical(model, moving) if following is not None else in_the_mean(samples)
+    splats = joined(splats, still)
     _require_finite(splats, samples)
     quats, turns = upright(splats.quats)
     splats = replace(splats, quats=quats)
@@ -72,7 +76,7 @@ def bake(model: Model, frames: int) -> Baked:
 
 def _moving(model: Model) -> int:
     """Return how many splats change in time: all if any of those that stand still does."""
-    first, last = (_at(model, time).detach() for time in (0.0, 1.0))
+    first, last = (at(model, time).detach() for time in (0.0, 1.0))
     same = all(
         torch.equal(one[model.moving :], other[model.moving :])
         for one, other in zip(first.tensors().values(), last.tensors().values(), strict=True)
@@ -80,13 +84,9 @@ def _moving(model: Model) -> int:
     return model.moving if same else len(model.splats)
 
 
-def _at(model: Model, time: float) -> Moment:
-    return model.at(model.instant(time))
-
-
 def _lives(model: Model, moving: int) -> Tensor | None:
     """Return the lives that a layer knows of; what further ones do is in the samples."""
-    given = model.splats.map(lambda tensor: tensor[:moving]).detach()
+    given = _canonical(model, moving)
     for layer in model.layers.values():
         lives = None if layer.before_motion else layer.lives(given)
         if lives is not None and len(lives) == moving:
@@ -102,65 +102,6 @@ def _canonical(model: Model, moving: int) -> Splats:
     """Return the splats that move as the motion is given them."""
     splats = model.canonical().splats.detach()
     return splats.map(lambda tensor: tensor[:moving])
-
-
-def _look(model: Model, times: Sequence[float], moving: int) -> tuple[Samples, Splats]:
-    """Return the splats that move at all times, and the others."""
-    found: dict[str, list[Tensor]] = {}
-    first: Tensor | None = None
-    for time in times:
-        moment = _at(model, time).detach()
-        quats, log_scales = rotations_and_scales(moment, first)
-        first = quats
-        splats = moment.splats
-        opacities = splats.logit_opacities.sigmoid()[:, None]
-        seen = splats.means, quats, log_scales, opacities, splats.sh.flatten(1)
-        for name, tensor in zip(_NAMES, seen, strict=True):
-            _add(found.setdefault(name, []), tensor[:moving])
-    still = replace(splats, quats=quats, log_scales=log_scales).map(lambda tensor: tensor[moving:])
-    return {name: _stacked(tensors) for name, tensors in found.items()}, still
-
-
-def _add(tensors: list[Tensor], tensor: Tensor) -> None:
-    """Append a tensor, or once more the first one if it is the same: that takes no memory."""
-    same = bool(tensors) and torch.equal(tensors[0], tensor)
-    tensors.append(tensors[0] if same else tensor)
-
-
-def _stacked(tensors: Sequence[Tensor]) -> Tensor:
-    """Return the tensors as one, (T, M, C)."""
-    if all(tensor is tensors[0] for tensor in tensors):
-        return tensors[0].expand(len(tensors), *tensors[0].shape)
-    return torch.stack(list(tensors))
-
-
-_NAMES = "means", "quats", "log_scales", "opacities", "sh"
-
-
-def _without_lives(samples: Samples, lives: Tensor | None, times: Sequence[float]) -> Samples:
-    """Return the samples with the opacities that lives take from, where these leave enough."""
-    if lives is None:
-        return samples
-    left = torch.stack([torch.exp(-exponents_of(lives, time)) for time in times])[:, :, None]
-    known = left >= FAINTEST
-    opacities = torch.where(known, samples["opacities"] / left.clamp(min=FAINTEST), 0.0)
-    mean = opacities.sum(dim=0) / known.sum(dim=0).clamp(min=1)
-    return {**samples, "opacities": torch.where(known, opacities, mean).clamp(max=1.0)}
-
-
-def _in_the_mean(samples: Samples) -> Splats:
-    """Return splats as they are in the mean over time."""
-    means, quats, log_scales, opacities, sh = (samples[name].mean(dim=0) for name in _NAMES)
-    middle = samples["quats"][len(samples["quats"]) // 2]
-    gone = quats.norm(dim=1, keepdim=True) < 0.1  # turned all the way round
-    logits = opacities[:, 0].clamp(UNSEEN, 1 - UNSEEN).logit()
-    quats = torch.where(gone, middle, quats)
-    return Splats(means, quats, log_scales, logits, sh.unflatten(1, (-1, 3)))
-
-
-def _joined(moving: Splats, still: Splats) -> Splats:
-    pairs = zip(moving.tensors().items(), still.tensors().values(), strict=True)
-    return Splats(**{name: torch.cat([first, second]) for (name, first), second in pairs})
 
 
 def _require_finite(splats: Splats, samples: Samples) -> None:
@@ -212,9 +153,9 @@ def _own_tracks(baked: Baked, samples: Samples, times: Sequence[float]) -> dict[
             COLOURS: seen["sh"] - splats.sh.flatten(1),
         }
         for name, tensor in apart.items():
-            _add(differences.setdefault(name, []), tensor)
-    stacked = {name: _stacked(tensors).permute(1, 2, 0) for name, tensors in differences.items()}
-    return {name: track_of(t) for name, t in stacked.items() if t.abs().max() > NOTHING}
+            add(differences.setdefault(name, []), tensor)
+    whole = {name: stacked(tensors).permute(1, 2, 0) for name, tensors in differences.items()}
+    return {name: track_of(t) for name, t in whole.items() if t.abs().max() > NOTHING}
 
 
 def _only_seen(baked: Baked, opacities: Tensor) -> Baked:

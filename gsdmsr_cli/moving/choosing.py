@@ -15,7 +15,8 @@ from typing import Protocol
 from gsdmsr_cli.ground.errors import DataError
 from gsdmsr_cli.ground.progress import OnProgress
 from gsdmsr_cli.moving.baked import Baked
-from gsdmsr_cli.moving.coding import CURVES, SHARES, coded, decoded, described, steps_named
+from gsdmsr_cli.moving.coding import CURVES, SHARES, coded, described, steps_named
+from gsdmsr_cli.moving.decoding import decoded
 from gsdmsr_cli.moving.parts import Part
 
 FINEST, COARSEST = -8, 6

@@ -15,7 +15,6 @@ from gsdmsr_cli.model.model import MOTION, Model
 from gsdmsr_cli.model.parameter import Parameter
 from gsdmsr_cli.model.times import inverse_durations
 from gsdmsr_cli.moving.baked import COLOURS, OF_BODIES, Baked, Bodies
-from gsdmsr_cli.moving.curves import Track
 from gsdmsr_cli.ops import skin
 from gsdmsr_cli.ops.nearest import nearest_points
 
@@ -109,6 +108,3 @@ def _near(bodies: Bodies, means: Tensor) -> Tensor:
         return bodies.body.to(torch.int32)[:, None].contiguous()
     near = torch.zeros(len(means), bodies.neighbours, dtype=torch.int32, device=means.device)
     return nearest_points(means, bodies.points, near)
-
-
-__all__ = ["Played", "Track", "exponents_of", "model_of"]

@@ -8,8 +8,8 @@ from typing import Any
 
 from gsdmsr_cli.ground.errors import DataError
 from gsdmsr_cli.model.model import MOTION, STORED_AS, Model
-from gsdmsr_cli.moving.coding import decoded
 from gsdmsr_cli.moving.container import SUFFIX, WRONG, from_bytes
+from gsdmsr_cli.moving.decoding import decoded
 from gsdmsr_cli.moving.playing import model_of
 from gsdmsr_cli.runs.checkpoints import Checkpoint
 
@@ -35,7 +35,7 @@ def about(path: Path) -> dict[str, Any]:
     Raises:
         DataError: it cannot be read, or says nothing of that.
     """
-    header, _ = _parts(path, path_bytes(path))
+    header, _ = _parts(path, bytes_of(path))
     found = header.get("about")
     if not isinstance(found, dict) or "preset" not in found:
         raise DataError(f"{path}: does not say which run it is of; only players can show it")
@@ -48,7 +48,7 @@ def load(path: Path) -> tuple[Model, Checkpoint]:
     Raises:
         DataError: the file cannot be read, or is damaged.
     """
-    data = path_bytes(path)
+    data = bytes_of(path)
     header, parts = _parts(path, data)
     try:
         model = model_of(decoded(header, parts))
@@ -67,7 +67,7 @@ def _stored_as(name: str) -> str:
     return f"{STORED_AS}{name}" if name in _OF_SPLATS else f"{MOTION}.{name}"
 
 
-def path_bytes(path: Path) -> bytes:
+def bytes_of(path: Path) -> bytes:
     """Return what a file holds.
 
     Raises:

@@ -10,10 +10,11 @@ from pathlib import Path
 from typing import Any
 
 from gsdmsr_cli.ground.errors import DataError
-from gsdmsr_cli.moving.coding import decoded
 from gsdmsr_cli.moving.container import WRONG, from_bytes
+from gsdmsr_cli.moving.decoding import decoded
 from gsdmsr_cli.moving.playing import model_of
 from gsdmsr_cli.moving.quick import quick_file
+from gsdmsr_cli.runs.moving_file import bytes_of
 from gsdmsr_cli.runs.run import Run, open_run, open_with_model
 from gsdmsr_cli.viewing import snapshots
 from gsdmsr_cli.viewing.held_out import HeldOut
@@ -68,10 +69,10 @@ class Showing:
 
     def _newest(self, run: Run) -> bytes | None:
         if run.is_file:
-            return _bytes_of(self._root)
+            return bytes_of(self._root)
         snapshot, checkpoint = snapshots.snapshot_path(self._root), run.checkpoint_path
         if _changed(snapshot) > _changed(checkpoint):
-            return _bytes_of(snapshot)
+            return bytes_of(snapshot)
         return self._of_checkpoint(checkpoint) if checkpoint.is_file() else None
 
     def _of_checkpoint(self, path: Path) -> bytes:
@@ -151,13 +152,6 @@ def _changed(path: Path) -> float:
         return path.stat().st_mtime
     except OSError:
         return 0.0
-
-
-def _bytes_of(path: Path) -> bytes:
-    try:
-        return path.read_bytes()
-    except OSError as error:
-        raise DataError(f"{path}: cannot be read: {error.strerror or error}") from error
 
 
 def _version(data: bytes) -> str:

@@ -7,7 +7,6 @@ from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 
-from gsdmsr_cli.ground.errors import DataError
 from gsdmsr_cli.ground.files import replacing
 
 FOLDER = "view"
@@ -83,6 +82,3 @@ class Snapshots:
         except OSError:
             return False
         return now - marked < FRESH
-
-
-__all__ = ["DataError", "Snapshots", "forget", "mark", "snapshot_path"]

@@ -22,8 +22,9 @@ from gsdmsr_cli.model.layer import Layer
 from gsdmsr_cli.model.model import FURTHER, MOTION, Model
 from gsdmsr_cli.moving.baked import Baked
 from gsdmsr_cli.moving.baking import bake
-from gsdmsr_cli.moving.coding import coded, decoded, described, steps_named
+from gsdmsr_cli.moving.coding import coded, described, steps_named
 from gsdmsr_cli.moving.container import from_bytes, to_bytes
+from gsdmsr_cli.moving.decoding import decoded
 from gsdmsr_cli.moving.playing import model_of
 from gsdmsr_cli.moving.shapes import rotations_and_scales, upright
 

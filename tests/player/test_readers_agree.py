@@ -12,8 +12,8 @@ import torch
 from chromium import Chromium
 from files_by_hand import File
 
-from gsdmsr_cli.moving.coding import decoded
 from gsdmsr_cli.moving.container import from_bytes
+from gsdmsr_cli.moving.decoding import decoded
 from gsdmsr_cli.moving.playing import model_of
 from gsdmsr_cli.player.page import _module
 
