@@ -117,7 +117,8 @@ function followKeys(player) {
 
 /** Whether a key is meant for the page's own elements, or for a dialog. */
 export function isTyping(event) {
-  return event.target.matches?.("select, input[type=text]") || document.querySelector("dialog[open]") !== null;
+  const elsewhere = document.querySelector("dialog[open]") !== null;
+  return elsewhere || event.target.matches?.("select, input[type=text]");
 }
 
 export const hasModifier = (event) => event.ctrlKey || event.metaKey || event.altKey;

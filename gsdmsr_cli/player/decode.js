@@ -130,7 +130,9 @@ function readTable(planes, entry) {
   for (let c = 0; c < columns; c++) {
     readColumn(planes, entry, c, column);
     if (signed || difference) {
-      for (let i = 0; i < rows; i++) column[i] = column[i] % 2 ? -(column[i] + 1) / 2 : column[i] / 2;
+      for (let i = 0; i < rows; i++) {
+        column[i] = column[i] % 2 ? -(column[i] + 1) / 2 : column[i] / 2;
+      }
     }
     if (difference) for (let i = 1; i < rows; i++) column[i] += column[i - 1];
     const base = least[c % least.length];

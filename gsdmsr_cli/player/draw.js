@@ -147,7 +147,8 @@ export class Drawing {
     gl.readPixels(0, 0, width, height, gl.RGBA, gl.UNSIGNED_BYTE, upwards);
     const found = new Uint8Array(upwards.length);
     for (let row = 0; row < height; row++) {
-      found.set(upwards.subarray(4 * width * row, 4 * width * (row + 1)), 4 * width * (height - 1 - row));
+      const from = 4 * width * row;
+      found.set(upwards.subarray(from, from + 4 * width), 4 * width * (height - 1 - row));
     }
     return found;
   }

@@ -196,7 +196,8 @@ export class Player {
   aim(x, y) {
     if (!this.scene || !this.drawing) return;
     const view = this.view();
-    const [column, row] = [x * view.width / this.canvas.clientWidth, y * view.height / this.canvas.clientHeight];
+    const { clientWidth, clientHeight } = this.canvas;
+    const [column, row] = [x * view.width / clientWidth, y * view.height / clientHeight];
     const depth = this.drawing.depthAt(column, row, 4 * this.camera.distance);
     this.invalidate();
     if (depth === null) return;

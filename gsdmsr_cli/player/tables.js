@@ -108,6 +108,6 @@ function colourShares(parts, { moving, sh_degree: degree }) {
 
 /** Return the values at t of all curves that a splat may have of its own, in the tables' order. */
 export function ownCurvesAt(parts, t) {
-  return [...OWN, "splat/sh"]
-    .flatMap((name) => (parts.has(`curves/${name}`) ? [...curvesAt(parts.get(`curves/${name}`), t)] : []));
+  return [...OWN, "splat/sh"].map((name) => parts.get(`curves/${name}`))
+    .flatMap((curves) => (curves ? [...curvesAt(curves, t)] : []));
 }

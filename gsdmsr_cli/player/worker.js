@@ -37,7 +37,8 @@ export function work() {
       else sort(number, wanted);
     } catch (error) {
       const known = error instanceof FileError;
-      postMessage({ number, fault: known ? error.message : `The file cannot be shown: ${error.message}.` });
+      const fault = known ? error.message : `The file cannot be shown: ${error.message}.`;
+      postMessage({ number, fault });
     }
   };
 }
