@@ -9,6 +9,7 @@ from typing import Any
 
 from gsdmsr_cli.commands._progress import progress_bar
 from gsdmsr_cli.commands._trained import Trained, open_trained
+from gsdmsr_cli.drawing.middle import middle
 from gsdmsr_cli.filming.draw_film import Timings, draw_film
 from gsdmsr_cli.filming.encode import require_encoder
 from gsdmsr_cli.filming.output_files import OutputFiles, shots_hash
@@ -18,12 +19,15 @@ from gsdmsr_cli.filming.sizes import sized
 from gsdmsr_cli.ground import say
 from gsdmsr_cli.ground.files import require_folder
 from gsdmsr_cli.ground.locks import one_of_readers, sole_writer
-from gsdmsr_cli.paths import make_film
+from gsdmsr_cli.paths import faces_centre, make_film
 from gsdmsr_cli.runs.outputs import FILMS
-from gsdmsr_cli.scene.film import Film, PathOptions
+from gsdmsr_cli.scene.film import ORIGIN, Film, PathOptions
 
 USUAL = ("test", "orbit")
 """Paths that are drawn if none is named."""
+
+LOOKED_AT = 16
+"""Most train views, evenly spaced in time, in which the middle of what they show is looked for."""
 
 
 def run(run_folder: Path, request: Request, out: Path | None, data: Path | None = None) -> None:
@@ -83,9 +87,21 @@ def _film(trained: Trained, path: str, request: Request) -> Film:
     """Return the film of a path in the size that is asked for."""
     # without a path, the number of frames is for the orbit
     frames = None if request.path is None and path == "test" else request.frames
-    options = PathOptions(frames, request.views)
+    centre = _middle(trained) if faces_centre(path) else ORIGIN
+    options = PathOptions(frames, request.views, centre)
     film = make_film(trained.scene, path, options, request.time, request.fps)
     return sized(film, trained.run.preset.data.downscale, request)
+
+
+def _middle(trained: Trained) -> tuple[float, float, float]:
+    """Return the middle of what the run shows [world units], the origin if there is no telling."""
+    views = sorted(trained.scene.split("train"), key=lambda view: view.time)
+    shots = [(view.camera, view.time) for view in views[:: -(-len(views) // LOOKED_AT)]]
+    point = middle(trained.renderer.model, shots, trained.renderer.engine)
+    if point is None:
+        return ORIGIN
+    x, y, z = point.tolist()
+    return x, y, z
 
 
 def _origin(trained: Trained, request: Request) -> dict[str, object]:

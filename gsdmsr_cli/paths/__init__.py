@@ -27,6 +27,12 @@ def path_names() -> list[str]:
     return sorted([*SPLITS, *plugins.names(__name__)])
 
 
+def faces_centre(path: str) -> bool:
+    """Return whether a path's cameras go round ``PathOptions.centre``; not if there is no such."""
+    made = path not in SPLITS and path in path_names()
+    return made and "centre" in plugins.load(__name__, path).TAKES
+
+
 def make_film(
     scene: Scene,
     path: str,

@@ -16,9 +16,6 @@ STEEPEST = math.radians(80)
 
 Vector = NDArray[np.float64]
 
-ORIGIN: Vector = np.zeros(3)
-"""The point that cameras face: formats centre the scene there, see ``Scene.bound``."""
-
 
 @dataclass(frozen=True, eq=False)
 class Surround:

@@ -5,12 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from gsdmsr_cli.paths._around import ORIGIN, Vector, surround
+import numpy as np
+
+from gsdmsr_cli.paths._around import Vector, surround
 from gsdmsr_cli.scene.camera import Camera
 from gsdmsr_cli.scene.film import PathOptions, Shot, over_time
 from gsdmsr_cli.scene.scene import Scene
 
-TAKES = frozenset({"frames"})
+TAKES = frozenset({"frames", "centre"})
 FRAMES = 120
 
 
@@ -21,7 +23,7 @@ def shots(scene: Scene, options: PathOptions) -> list[Shot]:
         DataError: there are no train views.
     """
     cameras = [view.camera for view in scene.split("train")]
-    return over_time(orbit(cameras, ORIGIN, options.frames or FRAMES))
+    return over_time(orbit(cameras, np.array(options.centre), options.frames or FRAMES))
 
 
 def orbit(cameras: Sequence[Camera], centre: Vector, count: int) -> list[Camera]:

@@ -7,12 +7,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from gsdmsr_cli.paths._around import ORIGIN, Surround, Vector, perpendicular, surround
+from gsdmsr_cli.paths._around import Surround, Vector, perpendicular, surround
 from gsdmsr_cli.scene.camera import Camera
 from gsdmsr_cli.scene.film import PathOptions, Shot, moments, over_time
 from gsdmsr_cli.scene.scene import Scene
 
-TAKES = frozenset({"frames"})
+TAKES = frozenset({"frames", "centre"})
 FRAMES = 180
 TURNS = 2
 NARROW = math.radians(60)
@@ -26,7 +26,7 @@ def shots(scene: Scene, options: PathOptions) -> list[Shot]:
         DataError: there are no train views.
     """
     cameras = [view.camera for view in scene.split("train")]
-    return over_time(spiral(cameras, ORIGIN, options.frames or FRAMES))
+    return over_time(spiral(cameras, np.array(options.centre), options.frames or FRAMES))
 
 
 def spiral(cameras: Sequence[Camera], centre: Vector, count: int) -> list[Camera]:

@@ -12,6 +12,10 @@ MADE_FPS, VIEWS_FPS = 30.0, 10.0
 """Frames a second of films of cameras that nobody held, and of those in the data."""
 
 
+ORIGIN = (0.0, 0.0, 0.0)
+"""Of the world: formats centre the scene there, see ``Scene.bound``."""
+
+
 @dataclass(frozen=True, eq=False)
 class Shot:
     """One frame of a film.
@@ -44,15 +48,18 @@ class Film:
 
 @dataclass(frozen=True)
 class PathOptions:
-    """What may be asked of a path; none takes all of it.
+    """What may be asked of a path, or is told to it; none takes all of it.
 
     Attributes:
         frames: number of frames.
         views: names of views, as ``find_view`` takes them.
+        centre: the point that cameras go round [world units]: the middle of what was
+            reconstructed, where that is known.
     """
 
     frames: int | None = None
     views: tuple[str, ...] = ()
+    centre: tuple[float, float, float] = ORIGIN
 
 
 def moments(count: int) -> list[float]:

@@ -43,7 +43,8 @@ def render(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Render
     """``gsdmsr render RUN --out`` a folder of this test."""
 
     def call(line: str, *more: object) -> int:
-        words = ["gsdmsr", "render", run, *line.split(), *more]
+        named = line.split() if not line.startswith("--") else [run, *line.split()]
+        words = ["gsdmsr", "render", *named, *more]
         if "--out" not in words:
             words += ["--out", tmp_path / "out"]
         monkeypatch.setattr(sys, "argv", [str(word) for word in words])
@@ -90,6 +91,27 @@ def test_every_output_has_its_files(render: Render, tmp_path: Path, capsys: Any)
     flow, channels = read_exr(out / "test-flow" / "0002.exr")
     assert channels == ("u", "v") and flow.shape == (48, 48, 2) and np.abs(flow).max() > 1
     assert re.search(r"^drew 4 frames of 48 x 48 px: .* s, \d+ % of it drawing$", told, re.M)
+
+
+@pytest.mark.parametrize("path", ["orbit", "spiral"])
+def test_cameras_go_round_what_was_reconstructed(
+    tiny_scene: Path, render: Render, tmp_path: Path, path: str
+) -> None:
+    """An object off the world's origin, which all cameras of the data face, is in the middle."""
+    run = begun_run(tiny_scene, tmp_path / "run", FEW)
+    checkpoint = run.load()
+    means = checkpoint.tensors["splats.means"]
+    means.copy_(0.2 * means + torch.tensor([0.3, -0.2, 0.5]))
+    checkpoint.tensors["splats.log_scales"].fill_(-3.5)
+    run.save(checkpoint)
+    line = f"{run.root} --path {path} --frames 8 --output alpha --video none"
+    assert render(line) == 0
+    rows, columns = np.mgrid[:48, :48] + 0.5
+    for file in sorted((tmp_path / "out" / f"{path}-alpha").glob("*.png")):
+        alpha = read_image(file)[..., 0].astype(np.float64)
+        assert alpha.max() > 100
+        centre = [(alpha * at).sum() / alpha.sum() for at in (columns, rows)]
+        assert centre == pytest.approx([24, 24], abs=1.5)
 
 
 def test_a_broken_film_is_gone_on_with(
