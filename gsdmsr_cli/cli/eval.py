@@ -59,6 +59,9 @@ def evaluate(
     report: Annotated[
         bool, typer.Option("--report", help="Write report.html and report.md too.")
     ] = False,
+    play: Annotated[
+        bool, typer.Option("--play", help="Write a page too that plays the run.")
+    ] = False,
     data: MovedData = None,
     verify_data: VerifyData = False,
 ) -> None:
@@ -69,7 +72,7 @@ def evaluate(
     demands = Demands(
         tuple(fail_under or ()), tuple(fail_over or ()), baseline, tuple(tolerance or ())
     )
-    output = Output(out, junit, github_summary, report)
+    output = Output(out, junit, github_summary, report, play)
     from gsdmsr_cli.commands import eval as command
 
     command.run(run_folder, request, demands, output, data)

@@ -7,7 +7,7 @@ from pathlib import Path
 from gsdmsr_cli.filming.output_files import remove_films
 from gsdmsr_cli.ground.errors import DataError
 from gsdmsr_cli.ground.files import read_json, remove_if_empty, remove_leftovers
-from gsdmsr_cli.runs.outputs import EVALUATION, FILMS, FLOW, FLOW_FILE, METRICS, REPORTS
+from gsdmsr_cli.runs.outputs import EVALUATION, FILMS, FLOW, FLOW_FILE, METRICS, PLAYED, REPORTS
 
 
 def remove_results(run_folder: Path) -> None:
@@ -47,7 +47,7 @@ def _remove_evaluation(folder: Path) -> None:
         ours = {"schema", "protocol", "aggregate"} <= read_json(folder / METRICS).keys()
     except DataError:
         ours = False
-    for name in (*REPORTS, METRICS) if ours else ():
+    for name in (*REPORTS, PLAYED, METRICS) if ours else ():
         (folder / name).unlink(missing_ok=True)
     remove_leftovers(folder)
     remove_if_empty(folder)

@@ -14,7 +14,7 @@ from gsdmsr_cli.filming.request import Request as FilmRequest
 from gsdmsr_cli.ground import say
 from gsdmsr_cli.ground.errors import DataError, UsageError
 from gsdmsr_cli.ground.locks import sole_writer
-from gsdmsr_cli.runs.outputs import EVALUATION, METRICS, REPORTS
+from gsdmsr_cli.runs.outputs import EVALUATION, METRICS, PLAYED, REPORTS
 from gsdmsr_cli.training.request import Request
 
 BUDGET = "60s"
@@ -37,7 +37,7 @@ def run(out: Path) -> None:
         _write_scene(scene)
         named = scene, run_folder, "dnerf", None, (f"training.budget={BUDGET}",)
         train.run(Request(*named, overwrite=run_folder.exists()))
-        evaluate.run(run_folder, None, None, Output(report=True))
+        evaluate.run(run_folder, None, None, Output(report=True, play=True))
         render.run(run_folder, FilmRequest(), None)
     parts = dict(zip(("train", "eval", "render"), answers, strict=False))
     places = _places(scene, run_folder)
@@ -69,6 +69,7 @@ def _places(scene: Path, run_folder: Path) -> list[tuple[str, str]]:
     places += [("video", path) for path in sorted(run_folder.rglob("*.webm"))]
     places += [("scores", run_folder / EVALUATION / METRICS)]
     places += [("report, for a browser", run_folder / EVALUATION / REPORTS[1])]
+    places += [("the scene to move about in, for a browser", run_folder / EVALUATION / PLAYED)]
     return [(what, str(path)) for what, path in places]
 
 

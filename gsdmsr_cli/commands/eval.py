@@ -10,6 +10,7 @@ from pathlib import Path
 from rich.markup import escape
 from rich.table import Table
 
+from gsdmsr_cli.commands import export
 from gsdmsr_cli.commands._measure import describe, measure
 from gsdmsr_cli.commands._trained import Trained, open_trained
 from gsdmsr_cli.evaluation import summary
@@ -24,7 +25,7 @@ from gsdmsr_cli.ground.files import require_folder, write_json, write_text
 from gsdmsr_cli.ground.locks import sole_writer
 from gsdmsr_cli.reporting.frames import make_report_frames
 from gsdmsr_cli.reporting.page import page
-from gsdmsr_cli.runs.outputs import EVALUATION, METRICS, REPORTS
+from gsdmsr_cli.runs.outputs import EVALUATION, METRICS, PLAYED, REPORTS
 
 SUMMARY_VARIABLE = "GITHUB_STEP_SUMMARY"
 """Environment variable in which GitHub Actions names the file of a step's summary."""
@@ -63,6 +64,9 @@ def run(
         held.enter_context(sole_writer(folder))
         if output.junit:
             require_folder(output.junit.parent, "choose another --junit or change the rights")
+        if output.play:
+            require_folder(folder)
+            export.write(run_folder, "html", {}, (), folder / PLAYED, data)
         document = measure(trained, request)
         verdicts = gates.judge(document)
         write_json(folder / METRICS, document)
@@ -71,7 +75,7 @@ def run(
         if summary_path:
             _append(summary_path, markdown(_heading(run_folder), document, verdicts))
         if output.report:
-            _report(folder, trained, document, verdicts)
+            _report(folder, trained, document, verdicts, PLAYED if output.play else None)
     say.result(document, *_shown(document, verdicts, folder, output))  # last of all
     missed = [verdict.found for verdict in verdicts if not verdict.passed]
     if missed:
@@ -83,13 +87,18 @@ def _heading(run_folder: Path) -> str:
 
 
 def _report(
-    folder: Path, trained: Trained, document: Document, verdicts: Sequence[Verdict]
+    folder: Path,
+    trained: Trained,
+    document: Document,
+    verdicts: Sequence[Verdict],
+    played: str | None,
 ) -> None:
     """Write the report for people, as HTML and as Markdown."""
     root = trained.run.root
     views, frames = trained.scene.split(document["protocol"]["split"]), document["frames"]
     shown, full = make_report_frames(trained.renderer, views, frames)
-    html = page(root.resolve().name, document, verdicts, trained.run.read_log(), shown, full)
+    log = trained.run.read_log()
+    html = page(root.resolve().name, document, verdicts, log, shown, full, played)
     write_text(folder / REPORTS[0], markdown(_heading(root), document, verdicts))
     write_text(folder / REPORTS[1], html)
 
@@ -116,6 +125,7 @@ def _shown(
     lines = [f"{'passed' if v.passed else 'FAILED'}: {v.found}" for v in verdicts]
     lines += [f"written to {folder / METRICS}"]
     lines += [f"report: {folder / REPORTS[1]}"] if output.report else []
+    lines += [f"a page that plays it: {folder / PLAYED}"] if output.play else []
     return [_table(document), *lines]
 
 

@@ -32,6 +32,23 @@ def run(
     out: Path,
     data: Path | None = None,
 ) -> None:
+    """Write the model of a run to ``out`` and tell, see ``write``."""
+    written = write(run_folder, format_, named, overrides, out, data)
+    count, splats = len(written.files), written.splats
+    what = f"{out}" if count == 1 else f"{out}, {count} files"
+    files = [str(path) for path in written.files]
+    document = {"format": format_, "files": files, "splats": splats, "lost": written.lost}
+    say.result(document | written.details, f"wrote {what}: {splats} splats", *_told(written))
+
+
+def write(
+    run_folder: Path,
+    format_: str,
+    named: Mapping[str, object],
+    overrides: Sequence[str],
+    out: Path,
+    data: Path | None = None,
+) -> exports.Written:
     """Write the model of a run to ``out``.
 
     Args:
@@ -51,12 +68,7 @@ def run(
     folder, model, checkpoint = open_with_model(run_folder)
     facts = _Source(folder, checkpoint, data)
     with progress_bar("writing splats") as on_progress, torch.no_grad():
-        written = exports.export(format_, model, facts, settings, out, on_progress)
-    count, splats = len(written.files), written.splats
-    what = f"{out}" if count == 1 else f"{out}, {count} files"
-    files = [str(path) for path in written.files]
-    document = {"format": format_, "files": files, "splats": splats, "lost": written.lost}
-    say.result(document | written.details, f"wrote {what}: {splats} splats", *_told(written))
+        return exports.export(format_, model, facts, settings, out, on_progress)
 
 
 def _told(written: exports.Written) -> list[str | Table]:

@@ -57,9 +57,11 @@ class Output:
         junit: file of JUnit XML to write.
         github_summary: whether to append Markdown to the file that GitHub Actions names.
         report: whether to write ``report.html`` and ``report.md`` beside ``metrics.json``.
+        play: whether to write a page beside them that plays the run, to which the report links.
     """
 
     folder: Path | None = None
     junit: Path | None = None
     github_summary: bool = False
     report: bool = False
+    play: bool = False

@@ -45,6 +45,7 @@ def page(
     log: Log,
     shown: Sequence[ReportFrame],
     full: float,
+    played: str | None = None,
 ) -> str:
     """Return the page.
 
@@ -55,6 +56,7 @@ def page(
         log: of the training.
         shown: frames to show, worst first.
         full: see ``viewer``.
+        played: name of a page beside this one that plays the run, if there is one.
     """
     about = document["protocol"]
     lede = (
@@ -73,11 +75,17 @@ def page(
         _section("Every frame", _frames(document)),
         _section("Protocol", _protocol(document)),
     ]
-    header = f'<p class="lede">{escape(lede)}</p>\n{_tiles(document)}'
+    header = f'<p class="lede">{escape(lede)}</p>\n{_link(played)}{_tiles(document)}'
     version = escape(about["versions"]["gsdmsr"])
     footer = f"Written by gsdmsr {version}. Every figure here stands,\n{_FOOTER}"
     title = f"{heading}: evaluation"
     return shell(title, "gsdmsr evaluation", heading, header, "".join(body), footer, "page.js")
+
+
+def _link(played: str | None) -> str:
+    if played is None:
+        return ""
+    return f'<p><a href="{escape(played)}">See it move</a>, in {escape(played)} beside this.</p>\n'
 
 
 def _section(title: str, content: str) -> str:

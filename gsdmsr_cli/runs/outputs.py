@@ -13,5 +13,8 @@ METRICS = "metrics.json"
 REPORTS = "report.md", "report.html"
 """The pages that eval writes beside it."""
 
+PLAYED = "play.html"
+"""The page that plays the run, which eval writes beside its report if asked."""
+
 FLOW, FLOW_FILE = "flow", re.compile(r"[0-9a-f]{32}\.npz")
 """The folder in that of a run that keeps flow between pictures, and how its files are called."""

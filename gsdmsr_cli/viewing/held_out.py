@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 import torch
 from torch import Tensor
@@ -14,6 +13,7 @@ from gsdmsr_cli.evaluation.metrics import quantize
 from gsdmsr_cli.ground.errors import DataError
 from gsdmsr_cli.model.model import Model
 from gsdmsr_cli.raster import Engine
+from gsdmsr_cli.scene.native import cv2
 from gsdmsr_cli.scene.pictures import Pictures
 from gsdmsr_cli.scene.scene import View
 

@@ -55,7 +55,7 @@ Gsdmsr = Any  # the fixture of conftest.py
             "eval r --split val --background both --downscale 2 --lpips-weights w --lpips-inria"
             " --json --fail-under psnr=25 --fail-under ssim=0.9 --fail-over lpips_alex=0.1"
             " --baseline b.json --tolerance psnr=0.5 --junit j.xml --github-summary --out o"
-            " --report --data d --verify-data",
+            " --report --play --data d --verify-data",
             "eval",
             (
                 Path("r"),
@@ -63,7 +63,7 @@ Gsdmsr = Any  # the fixture of conftest.py
                 Demands(
                     ("psnr=25", "ssim=0.9"), ("lpips_alex=0.1",), Path("b.json"), ("psnr=0.5",)
                 ),
-                Output(Path("o"), Path("j.xml"), True, True),
+                Output(Path("o"), Path("j.xml"), True, True, True),
                 Path("d"),
             ),
         ),

@@ -53,9 +53,11 @@ def test_it_makes_trains_evaluates_renders_and_tells(
     assert budget is not None
     assert parse_duration(budget) <= 90
     assert calls[1][1][0] == run_folder and calls[1][1][-1].report
+    assert calls[1][1][-1].play
     told = capsys.readouterr().out
     for path in ("scene/train", "run/orbit.webm", "run/eval/metrics.json", "run/eval/report.html"):
         assert str(out / path) in told
+    assert f"move about in, for a browser: {out / 'run' / 'eval' / 'play.html'}\n" in told
 
 
 def test_an_earlier_demo_is_made_anew(tmp_path: Path, calls: Calls) -> None:

@@ -302,6 +302,18 @@ def test_parts_that_masks_choose_are_scored_where_they_are(
     assert "psnr_moving has no value" in refuse(4, "--fail-under", "psnr_moving=1")
 
 
+def test_a_page_that_plays_the_run_lies_beside_the_report_if_asked(
+    evaluate: Eval, tmp_path: Path
+) -> None:
+    link = '<a href="play.html">'
+    evaluate("--report", "--out", tmp_path / "a")
+    assert not (tmp_path / "a" / "play.html").exists()
+    assert link not in (tmp_path / "a" / "report.html").read_text(encoding="utf-8")
+    evaluate("--report", "--play", "--out", tmp_path / "b")
+    assert link in (tmp_path / "b" / "report.html").read_text(encoding="utf-8")
+    assert "<canvas" in (tmp_path / "b" / "play.html").read_text(encoding="utf-8")
+
+
 def test_the_report_shows_the_run_in_one_file(
     run: Path, evaluate: Eval, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -15,6 +15,7 @@ OURS = {
     "eval/metrics.json": json.dumps(REPORT),
     "eval/report.html": "",
     "eval/report.md": "",
+    "eval/play.html": "",
     f"eval/.gsdmsr-{'0f' * 16}.part.json": "",
     f"flow/{'0f' * 16}.npz": "",
     f"flow/.gsdmsr-{'0f' * 16}.part.npz": "",

@@ -75,6 +75,12 @@ def test_the_page_is_well_formed_and_asks_for_nothing_else() -> None:
     assert not re.search(r"\b(nan|inf|None|undefined)\b", "".join(reader.texts))
 
 
+def test_the_page_links_to_the_one_that_plays() -> None:
+    given = "r", small_report(), [], LOG, SHOWN_FRAMES, 0.1
+    linked = [a for a in read(page(*given, "play&.html")).addresses if not a.startswith("data:")]
+    assert linked == ["play&.html"]
+
+
 def test_every_figure_is_one_of_the_report() -> None:
     document, reader = small_report(), read(made())
     for path, value, text in reader.figures:
