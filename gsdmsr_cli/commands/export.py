@@ -20,6 +20,7 @@ from gsdmsr_cli.model.model import Model
 from gsdmsr_cli.options.preset_files import read_overrides
 from gsdmsr_cli.options.strict import Located
 from gsdmsr_cli.runs.checkpoints import Checkpoint
+from gsdmsr_cli.runs.moving_file import bytes_of
 from gsdmsr_cli.runs.run import Run, open_with_model
 from gsdmsr_cli.scene.scene import Scene
 
@@ -115,6 +116,10 @@ class _Source:
     def describe(self, folder: Path) -> None:
         """Write the run's description to another folder."""
         self.run.describe_at(folder)
+
+    def file(self) -> bytes | None:
+        """Return the file that stands for the run, if one does."""
+        return bytes_of(self.run.root) if self.run.is_file else None
 
     def about(self) -> dict[str, Any]:
         """Return the run's description, without the place of its data."""

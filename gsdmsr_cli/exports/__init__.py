@@ -50,6 +50,9 @@ class RunFacts(Facts, Protocol):
     def describe(self, folder: Path) -> None:
         """Write to a new folder what the run's own says of its options, its scene and pictures."""
 
+    def file(self) -> bytes | None:
+        """Return the ``.dsplat`` that stands for the run, or None if it is a folder."""
+
     def about(self) -> dict[str, Any]:
         """Return the run's options and scene as plain JSON, without any place on this machine."""
 

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
+from typing import cast
 from urllib.parse import unquote, urlsplit
 
-from gsdmsr_cli.exports import Facts, _played
+from gsdmsr_cli.exports import Facts, RunFacts, _played
 from gsdmsr_cli.exports._moment import require_suffix, write_bytes
 from gsdmsr_cli.exports._played import file_of, lost
 from gsdmsr_cli.exports._source import Source
@@ -40,7 +41,7 @@ class Options(_played.Options):
 def write(
     source: Source, facts: Facts, options: Options, out: Path, on_progress: OnProgress
 ) -> list[Path]:
-    """Write the page, and the file if that is to lie beside it.
+    """Write the page, and the file if that is to lie beside it; of a file that file as it is.
 
     Raises:
         UsageError: ``out`` does not end in .html, or something is asked for that the file has not.
@@ -48,7 +49,7 @@ def write(
             cannot be written.
     """
     require_suffix(out, "html", ".html")
-    data = file_of(source, facts, options, on_progress)
+    data = cast(RunFacts, facts).file() or file_of(source, facts, options, on_progress)
     if options.embed is None:
         return write_bytes(out, page(data, None, out.stem).encode())
     beside = write_bytes(out.with_name(_name(options.embed)), data)

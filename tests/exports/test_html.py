@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import re
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -31,9 +32,21 @@ def coded(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
     return asked
 
 
-def write(out: Path, **settings: Any) -> list[Path]:
+@dataclass(frozen=True)
+class Run:
+    """What the command tells of a run, as far as a page wants to know."""
+
+    held: bytes | None
+    bound: float = FACTS.bound
+    frames: int = FACTS.frames
+
+    def file(self) -> bytes | None:
+        return self.held
+
+
+def write(out: Path, held: bytes | None = None, **settings: Any) -> list[Path]:
     model = model_of(usual_splats(3, 0), Falling())
-    return export("html", model, FACTS, Located(settings), out).files
+    return export("html", model, Run(held), Located(settings), out).files
 
 
 def test_the_page_holds_the_file(tmp_path: Path, coded: list[Any]) -> None:
@@ -43,6 +56,13 @@ def test_the_page_holds_the_file(tmp_path: Path, coded: list[Any]) -> None:
     held = re.search(r'<script type="text/plain" id="file">([^<]*)</script>', text)
     assert held and base64.b64decode(held[1]) == FILE
     assert "<title>a run</title>" in text and coded[0].loss == 0.2
+
+
+def test_a_file_is_held_as_it_is(tmp_path: Path, coded: list[Any]) -> None:
+    out = tmp_path / "page.html"
+    write(out, held=b"dsplat\r\n of before")
+    assert base64.b64encode(b"dsplat\r\n of before").decode() in out.read_text("utf-8")
+    assert not coded
 
 
 @pytest.mark.parametrize(
