@@ -148,7 +148,7 @@ def export(
     options = _read_options(format_, exporter.Options, settings if whole else own)
     asked = strict.build(Asked, common, f"--format {format_}")
     axes = asked.axes or getattr(exporter, "AXES", "scene")
-    source = Source(model, replace(asked, axes=axes))
+    source = Source(model, replace(asked, axes=axes), facts)
     lost = [] if whole else _lost(format_, exporter, source, options)
     files = exporter.write(source, facts, options, out, on_progress)
     splats = max(source.counts, default=len(model.splats))

@@ -8,6 +8,7 @@ from typing import Any
 
 import torch
 
+from gsdmsr_cli.exports import Facts
 from gsdmsr_cli.exports._asked import Asked
 from gsdmsr_cli.gaussians.splats import Splats
 from gsdmsr_cli.gaussians.turning import turn_world
@@ -35,12 +36,14 @@ class Source:
     Attributes:
         model: what is written.
         asked: axes, units, harmonics and which splats.
+        facts: of its scene.
         counts: of the splats at each time that has been asked for; grows.
         details: what a format has to tell of its files, plain JSON; grows.
     """
 
     model: Model
     asked: Asked
+    facts: Facts
     counts: list[int] = field(default_factory=list)
     details: dict[str, Any] = field(default_factory=dict)
 
@@ -54,8 +57,13 @@ class Source:
         axes, scale = self.asked.axes or "scene", self.asked.scale
         if axes in ("scene", "z-up") and scale == 1:
             return cut
-        rotation = AXES.get(axes, AXES["z-up"])
-        return turn_world(cut, torch.tensor(rotation, dtype=torch.float64), scale)
+        return turn_world(cut, self.rotation, scale)
+
+    @property
+    def rotation(self) -> torch.Tensor:
+        """From the scene's directions to the file's, (3, 3) float64."""
+        axes = AXES.get(self.asked.axes or "scene", AXES["z-up"])
+        return torch.tensor(axes, dtype=torch.float64)
 
     @property
     def sh_degree(self) -> int:
@@ -81,14 +89,19 @@ class Source:
         return [] if getattr(moment, name) is None else [_NOT_CARRIED[name]]
 
 
+def as_float32(splats: Splats) -> Splats:
+    """Return splats as float32 on the CPU, their quaternions of unit length."""
+    splats = splats.map(lambda tensor: tensor.detach().cpu())
+    return replace(splats, quats=_unit_quats(splats.quats)).map(torch.Tensor.float)
+
+
 def as_written(splats: Splats, path: Path) -> Splats:
     """Return splats as float32 on the CPU, their quaternions of unit length.
 
     Raises:
         DataError: a splat holds NaN or infinity.
     """
-    splats = splats.map(lambda tensor: tensor.detach().cpu())
-    written = replace(splats, quats=_unit_quats(splats.quats)).map(torch.Tensor.float)
+    written = as_float32(splats)
     rows = torch.cat([t.flatten(1) for t in map(_as_rows, written.tensors().values())], dim=1)
     broken = int((~rows.isfinite()).any(dim=1).sum())
     if broken:

@@ -42,13 +42,14 @@ NOTHING = 1e-6
 
 
 @torch.no_grad()
-def bake(model: Model, frames: int) -> Baked:
+def bake(model: Model, frames: int, least_opacity: float = ALPHA_MIN) -> Baked:
     """Return a model's splats and how they move; those that are never seen are left out.
 
     Args:
         model: on a CPU; its splats do not depend on the camera. Features and ``shade`` are not
             baked.
         frames: number of distinct times at which it has been trained.
+        least_opacity: splats that are never as opaque are never seen.
 
     Raises:
         DataError: a splat holds NaN or infinity.
@@ -71,7 +72,8 @@ def bake(model: Model, frames: int) -> Baked:
     baked = Baked(splats, moving, count, bodies, tracks)
     own = _own_tracks(baked, samples, times)
     opacities = samples["opacities"].amax(dim=0)[:, 0]
-    return _only_seen(replace(baked, tracks={**tracks, **own}, lives=lives), opacities)
+    baked = replace(baked, tracks={**tracks, **own}, lives=lives)
+    return _only_seen(baked, opacities, least_opacity)
 
 
 def _moving(model: Model) -> int:
@@ -158,14 +160,14 @@ def _own_tracks(baked: Baked, samples: Samples, times: Sequence[float]) -> dict[
     return {name: track_of(t) for name, t in whole.items() if t.abs().max() > NOTHING}
 
 
-def _only_seen(baked: Baked, opacities: Tensor) -> Baked:
-    """Return what is baked without splats that are never opaque enough to be drawn.
+def _only_seen(baked: Baked, opacities: Tensor, least: float) -> Baked:
+    """Return what is baked without splats that are never as opaque as ``least``.
 
     opacities (M,) are the largest of those that move.
     """
     largest = baked.splats.logit_opacities.sigmoid()
     largest[: baked.moving] = opacities
-    rows = (largest >= ALPHA_MIN).nonzero().flatten()
+    rows = (largest >= least).nonzero().flatten()
     moving = rows[rows < baked.moving]
     bodies = baked.bodies
     if bodies is not None and bodies.body is not None:
