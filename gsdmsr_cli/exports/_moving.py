@@ -15,7 +15,7 @@ from gsdmsr_cli.gaussians.splats import Splats
 from gsdmsr_cli.ground.geometry import SH_C0
 from gsdmsr_cli.ground.splatting_constants import ALPHA_MIN
 from gsdmsr_cli.moving.baking import bake
-from gsdmsr_cli.moving.playing import exponents_of, model_of
+from gsdmsr_cli.moving.playing import UNSEEN, exponents_of, model_of
 
 LEAST_TIMES = 16
 """At which a model is looked at, however few frames it was trained with: it moves between them."""
@@ -66,6 +66,17 @@ def _shares(splats: Splats) -> dict[str, Tensor]:
     return {"colours": SH_C0 * splats.sh, "opacities": opacities, "sizes": splats.log_scales}
 
 
+def in_the_mean(moving: Moving, times: Sequence[float], splats: Splats) -> Splats:
+    """Return splats with the opacities and colours that those that move have in the mean."""
+    opacities, sh = torch.zeros_like(splats.logit_opacities), torch.zeros_like(splats.sh)
+    for time in times:
+        seen = moving.at(time)
+        opacities += seen.logit_opacities.sigmoid() / len(times)
+        sh += seen.sh / len(times)
+    logits = opacities.clamp(UNSEEN, 1 - UNSEEN).logit()
+    return replace(splats, logit_opacities=logits, sh=sh)
+
+
 def evenly(count: int) -> list[float]:
     """Return so many times from 0 to 1, both included; 0 alone where there is one."""
     return [i / max(count - 1, 1) for i in range(count)]
@@ -83,7 +94,9 @@ def moving(source: Source, frames: int) -> Moving:
         DataError: a splat holds NaN or infinity.
     """
     least = max(source.asked.min_opacity, ALPHA_MIN)
-    baked = bake(source.model, max(frames, LEAST_TIMES), least)
+    steps = max(frames - 1, 1)
+    between = -(-(LEAST_TIMES - 1) // steps)  # so that what is looked at has the frames in it
+    baked = bake(source.model, between * steps + 1, least)
     source.counts.append(len(baked.splats))
     lives = baked.lives
     if lives is not None:

@@ -35,13 +35,18 @@ def write_ply(path: Path, splats: Splats) -> None:
     Raises:
         DataError: a splat holds NaN or infinity, or the file cannot be written.
     """
-    table = _table(as_written(splats, path))
-    names = _column_names(3 * (splats.sh.shape[1] - 1))
-    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(table)}"]
-    header += [f"property float {name}" for name in names] + ["end_header", ""]
+    table = columns_of(as_written(splats, path))
+    header = [*header_of(splats), "end_header", ""]
     with replacing(path) as beside:
         path.parent.mkdir(parents=True, exist_ok=True)
         beside.write_bytes("\n".join(header).encode("ascii") + table.tobytes())
+
+
+def header_of(splats: Splats) -> list[str]:
+    """Return the lines of the header up to the end of the splats' properties."""
+    names = _column_names(3 * (splats.sh.shape[1] - 1))
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(splats)}"]
+    return header + [f"property float {name}" for name in names]
 
 
 def read_ply(path: Path) -> Splats:
@@ -60,8 +65,8 @@ def _column_names(rest: int) -> tuple[str, ...]:
     return _MEANS + _NORMALS + _DC + rests + _OPACITY + _SCALES + _QUATS
 
 
-def _table(splats: Splats) -> Array:
-    """Return the columns of the file, (N, 17 + 3 (K - 1)) little-endian float32."""
+def columns_of(splats: Splats) -> Array:
+    """Return columns, (N, 17 + 3 (K - 1)) little-endian float32; quaternions are of unit length."""
     columns = [
         splats.means,
         torch.zeros_like(splats.means),
