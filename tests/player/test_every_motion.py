@@ -16,8 +16,9 @@ from gsdmsr_cli.ground import plugins
 from gsdmsr_cli.model import motion as motions
 from gsdmsr_cli.model.model import MOTION, Model
 from gsdmsr_cli.moving.baking import bake
-from gsdmsr_cli.moving.coding import coded, decoded, described, steps_named
+from gsdmsr_cli.moving.coding import coded, described, steps_named
 from gsdmsr_cli.moving.container import from_bytes, to_bytes
+from gsdmsr_cli.moving.decoding import decoded
 from gsdmsr_cli.moving.playing import model_of
 from gsdmsr_cli.raster import reference
 from gsdmsr_cli.scene.camera import Camera, look_at
