@@ -18,6 +18,9 @@ _PNG_SETTINGS = (
     cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE,
 )  # fmt: skip
 
+_LOSSLESS = 101
+"""A quality of WebP pictures above 100 leaves all as it is."""
+
 
 def read_image(path: Path, kinds: tuple[str, ...] = IN_SCENES) -> NDArray[np.uint8]:
     """Return the pixels of ``path``, (H, W, C) with C = 1 (grey), 3 (RGB) or 4 (RGBA).
@@ -68,6 +71,16 @@ def write_png(path: Path, image: NDArray[np.uint8]) -> None:
     encoded = cv2.imencode(".png", ordered, _PNG_SETTINGS)[1]
     with replacing(path, durable=False) as temporary:
         temporary.write_bytes(encoded.tobytes())
+
+
+def encode_lossless_webp(pixels: NDArray[np.uint8]) -> bytes:
+    """Return a WebP file of (H, W, 3 or 4) RGB or RGBA bytes, which reads back byte by byte.
+
+    Colours under alpha 0 are not kept: there may be none.
+    """
+    order = [2, 1, 0, 3][: pixels.shape[2]]
+    ordered = np.ascontiguousarray(pixels[..., order])
+    return cv2.imencode(".webp", ordered, (cv2.IMWRITE_WEBP_QUALITY, _LOSSLESS))[1].tobytes()
 
 
 def encode_webp(image: NDArray[np.uint8], quality: int) -> bytes:

@@ -1,7 +1,7 @@
 """Files of one moment, read back by readers written here from the layouts, and by somebody else's.
 
-gsply is a package on the registry that reads PLY, compressed PLY and SPZ; without it those tests
-are skipped.
+gsply and PlayCanvas' splat-transform are packages on registries that read some of them; without
+them those tests are skipped.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ import gzip
 import json
 import re
 import struct
+import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,9 +19,12 @@ import numpy as np
 import pytest
 import torch
 from export_checks import Array, angles, sigmoid, unit, usual_splats, write
+from node_packages import node, package
 
+from gsdmsr_cli.exports._ply import read_ply
 from gsdmsr_cli.gaussians.splats import Splats
 from gsdmsr_cli.ground.errors import DataError, UsageError
+from gsdmsr_cli.scene.native import cv2
 
 SH_C0 = 0.28209479177387814
 
@@ -163,6 +167,49 @@ def read_glb(path: Path) -> Read:
     )  # fmt: skip
 
 
+def pixels(content: bytes) -> Array:
+    """Return the RGBA pixels of a lossless WebP picture from the first row on, (H, W, 4) int64."""
+    assert content[:4] + content[8:16] == b"RIFFWEBPVP8L"
+    picture = cv2.imdecode(np.frombuffer(content, "u1"), cv2.IMREAD_UNCHANGED)
+    opaque = np.full((*picture.shape[:2], 1), 255)
+    return np.concatenate([picture[..., 2::-1], picture[..., 3:], opaque], axis=2)[..., :4]
+
+
+def read_sog(path: Path) -> Read:
+    archive = zipfile.ZipFile(path)
+    meta = json.loads(archive.read("meta.json"))
+    assert meta["version"] == 2 and archive.testzip() is None
+    count = meta["count"]
+
+    def table(part: str, place: int = 0) -> Array:
+        picture = pixels(archive.read(meta[part]["files"][place]))
+        assert picture.shape[0] * picture.shape[1] >= count
+        return picture.reshape(-1, 4)[:count]
+
+    low, high = (np.array(meta["means"][name]) for name in ("mins", "maxs"))
+    logs = low + (table("means") + 256 * table("means", 1))[:, :3] / 65535 * (high - low)
+    turn, colours = table("quats"), table("sh0")
+    assert not count or (turn[:, 3].min() >= 252 and colours[:, 3].min() > 0)
+    constants = np.array(meta["sh0"]["codebook"])[colours[:, :3]]
+    harmonics = np.zeros((count, 0, 3))
+    if "shN" in meta:
+        bands, width = meta["shN"]["bands"], (meta["shN"]["bands"] + 1) ** 2 - 1
+        known = pixels(archive.read(meta["shN"]["files"][0]))
+        assert known.shape[1] == 64 * width and bands in (1, 2, 3)
+        labels = table("shN", 1)[:, 0] + 256 * table("shN", 1)[:, 1]
+        assert labels.max() < meta["shN"]["count"]
+        rows = np.array(meta["shN"]["codebook"])[known[..., :3]].reshape(-1, width, 3)
+        harmonics = rows[labels]
+    return Read(
+        np.sign(logs) * np.expm1(np.abs(logs)),
+        with_largest(turn[:, 3] - 252, (turn[:, :3] / 255 - 0.5) * np.sqrt(2)),
+        np.array(meta["scales"]["codebook"])[table("scales")[:, :3]],
+        colours[:, 3] / 255,
+        constants,
+        harmonics,
+    )
+
+
 @dataclass(frozen=True)
 class Form:
     """A format: its suffix, a reader, and how far from the truth each part may be."""
@@ -184,6 +231,7 @@ FORMS = {
         ".compressed.ply", read_compressed_ply, 0.006, 0.004, 0.005, BYTE, 0.03, 4 / 256
     ),
     "spz": Form(".spz", read_spz, 0.5 / 4096, 0.006, 0.5 / 16, BYTE, BYTE / 0.15, 0.5 / 128),
+    "sog": Form(".sog", read_sog, 3e-4, 0.015, 0.04, BYTE, 0.04, 0.01),
     "gltf": Form(".glb", read_glb, 0, 1e-6, 1e-6, 1e-6, 0, 0),
 }
 SLACK = 1e-6
@@ -311,4 +359,21 @@ def test_somebody_else_reads_the_same(tmp_path: Path, format_: str, degree: int)
     opacities = sigmoid(torch.from_numpy(np.array(data.opacities).reshape(-1)))
     constants = np.asarray(data.sh0).reshape(-1, 3)
     read = Read(data.means, np.asarray(data.quats), data.scales, opacities, constants, rest)
+    assert_holds(form, splats, read)
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+@pytest.mark.parametrize("format_", ["sog", "compressed-ply", "ply"])
+def test_splat_transform_reads_the_same(tmp_path: Path, format_: str, degree: int) -> None:
+    program = package("@playcanvas/splat-transform") / "bin" / "cli.mjs"
+    form = FORMS.get(format_, FORMS["gltf"])
+    splats = usual_splats(300, degree)
+    out = tmp_path / f"a{'.ply' if format_ == 'ply' else form.suffix}"
+    write(format_, splats, out, axes="scene")
+    node(program, out, tmp_path / "theirs.ply")
+    theirs = read_ply(tmp_path / "theirs.ply")
+    read = Read(
+        theirs.means.numpy(), theirs.quats.numpy(), theirs.log_scales.numpy(),
+        sigmoid(theirs.logit_opacities), theirs.sh[:, 0].numpy(), theirs.sh[:, 1:].numpy(),
+    )  # fmt: skip
     assert_holds(form, splats, read)
