@@ -413,6 +413,7 @@ def test_every_subcommand_has_a_page_that_names_its_options(command: str) -> Non
         "demo",
         "presets",
         "view",
+        "export",
     ):  # these name options of other commands too
         unknown = set(re.findall(r"(?<![\w-])--[a-z][a-z-]*", text)) - known
         assert not unknown - {"--data", "--preset"}, unknown
