@@ -20,7 +20,7 @@ PANELS = {
     "Pictures": ("output", "video", "size", "scale", "supersample", "fps"),
     "Output": (
         "out", "overwrite", "keep", "keep_stages", "report", "dry_run", "tensorboard", "wandb",
-        "view_", "port",
+        "live", "port",
     ),
     "Machine": ("device", "threads", "jobs"),
 }  # fmt: skip

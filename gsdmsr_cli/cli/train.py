@@ -68,7 +68,7 @@ def train(
         str | None,
         typer.Option(metavar="PROJECT", help="Log to Weights & Biases too; needs wandb."),
     ] = None,
-    view: Annotated[
+    live: Annotated[
         bool, typer.Option("--view", help="Serve a page that shows the training.")
     ] = False,
     port: Annotated[
@@ -92,7 +92,7 @@ def train(
     overrides = *(set_ or ()), *_overrides(options)
     named = data, out, preset, config, overrides, device
     request = Request(*named, resume, overwrite, dry_run, verify_data, tensorboard, wandb)
-    request = replace(request, view_port=port if view else None)
+    request = replace(request, view_port=port if live else None)
     from gsdmsr_cli.commands import train as command
 
     command.run(request)

@@ -15,7 +15,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import torch
 from numpy.typing import NDArray
@@ -53,17 +53,31 @@ class Channel(Protocol):
         """Let the worker end."""
 
 
+class _Sizes(NamedTuple):
+    """How large a model is.
+
+    Attributes:
+        splats: how many there are.
+        moving: how many of them move.
+        shapes: of the model's tensors in their order: an event may change those of any.
+    """
+
+    splats: int
+    moving: int
+    shapes: tuple[tuple[int, ...], ...]
+
+
 @dataclass(frozen=True)
 class _Task:
     """What goes to a worker; tensors as arrays, for torch would put them into files.
 
     Attributes:
-        sizes: how many splats there are and how many move, if that is new, else None.
+        sizes: how large the model is, if that is new, else None.
         gradient_mask, progress, moving: see ``Phase``.
         orders: see ``Order``, tile weights as arrays.
     """
 
-    sizes: tuple[int, int] | None
+    sizes: _Sizes | None
     gradient_mask: NDArray[Any] | None
     progress: float
     moving: bool
@@ -107,7 +121,7 @@ class ForkedChannel:
         self._answers = [SharedBuffers(trained, capacity, {_ON_SCREEN: 2}) for _ in range(views)]
         self._published = published
         self._ready = False
-        self._sizes = (0, 0)
+        self._sizes: _Sizes | None = None
         self._pipe, theirs = multiprocessing.Pipe()
         worker = _Worker(renderer, model, published, self._answers)
         # a copy of this end in any worker would keep that worker from noticing the training's end
@@ -127,7 +141,8 @@ class ForkedChannel:
     def send(self, model: Model, orders: Sequence[Order], phase: Phase) -> None:
         """Let the worker render views of the model, whose tensors have been published."""
         self.wait()
-        sizes = len(model.splats), model.moving
+        shapes = tuple(tuple(parameter.tensor.shape) for parameter in model.parameters())
+        sizes = _Sizes(len(model.splats), model.moving, shapes)
         news = None if sizes == self._sizes else sizes
         self._sizes = sizes
         task = _Task(
@@ -201,8 +216,8 @@ class _Worker:
         """Render the task's views and go backward."""
         model = self._model
         if task.sizes is not None:
-            model.become(*task.sizes)
-            self._published.attach(model)
+            model.become(task.sizes.splats, task.sizes.moving)
+            self._published.attach(model, task.sizes.shapes)
         model.advance(task.progress)
         phase = Phase(task.progress, task.moving, _received(task.gradient_mask))
         answers = []

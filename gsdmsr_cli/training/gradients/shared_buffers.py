@@ -64,10 +64,10 @@ class SharedBuffers:
                 place.copy_(parameter.tensor.detach())
                 parameter.tensor.data = place
 
-    def attach(self, model: Model) -> None:
-        """Let the model's tensors be those that lie here."""
-        for parameter in model.parameters():
-            parameter.tensor.data = self.tensor(parameter.name, parameter.tensor.shape)
+    def attach(self, model: Model, shapes: Iterable[Sequence[int]]) -> None:
+        """Let the model's tensors be those that lie here, of these shapes."""
+        for parameter, shape in zip(model.parameters(), shapes, strict=True):
+            parameter.tensor.data = self.tensor(parameter.name, shape)
 
     @torch.no_grad()
     def write(self, tensors: Mapping[str, Tensor]) -> None:
