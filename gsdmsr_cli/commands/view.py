@@ -76,7 +76,8 @@ def run(
             f"cannot listen at {host}, port {port}: {error}; choose another --port or --host"
         ) from error
     document = {"run": str(run_folder), "address": server.address}
-    say.result(document, f"{run_folder} plays at {server.address}", "Ctrl-C ends it")
+    ends = () if WITH_PARENT in os.environ else ("Ctrl-C ends it",)
+    say.result(document, f"{run_folder} plays at {server.address}", *ends)
     if opens:
         webbrowser.open(server.address)
     _serve(server)

@@ -11,7 +11,7 @@ import subprocess
 import sys
 import time
 import urllib.request
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -49,12 +49,18 @@ class Looked:
             self.process = subprocess.Popen(
                 line_of(data, out, "--view"), stdout=subprocess.PIPE, stderr=shown
             )
-        deadline = time.monotonic() + 120
-        while (found := re.search(r"http://\S+", self.text())) is None:
-            assert time.monotonic() < deadline and self.process.poll() is None, self.text()
-            time.sleep(0.05)
-        self.address = found[0]
+        self._wait_for(lambda: (out / "checkpoint.safetensors").is_file())
+        self.process.send_signal(signal.SIGSTOP)  # a busy machine starts the server slowly
+        self._wait_for(lambda: "http://" in self.text())
+        self.process.send_signal(signal.SIGCONT)
+        self.address = re.findall(r"http://\S+", self.text())[0]
         self.port = int(self.address.rpartition(":")[2].strip("/"))
+
+    def _wait_for(self, seen: Callable[[], bool]) -> None:
+        deadline = time.monotonic() + 120
+        while not seen():
+            assert time.monotonic() < deadline and self.process.poll() is None, self.text()
+            time.sleep(0.02)
 
     def text(self) -> str:
         return self.log.read_text(encoding="utf-8")
