@@ -49,7 +49,7 @@ class Looked:
             self.process = subprocess.Popen(
                 line_of(data, out, "--view"), stdout=subprocess.PIPE, stderr=shown
             )
-        self._wait_for(lambda: (out / "checkpoint.safetensors").is_file())
+        self._wait_for(lambda: (out / "metrics.jsonl").is_file())  # the server has been started
         self.process.send_signal(signal.SIGSTOP)  # a busy machine starts the server slowly
         self._wait_for(lambda: "http://" in self.text())
         self.process.send_signal(signal.SIGCONT)
