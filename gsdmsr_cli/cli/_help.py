@@ -30,6 +30,7 @@ FEW = 8
 """Commands with no more options than this have no panels but the usual one."""
 
 EXAMPLES = {
+    "make": "gsdmsr make dog.mp4 --out dog --budget 10m",
     "prepare": "gsdmsr prepare dog.mp4 --out scenes/dog",
     "train": "gsdmsr train --data scenes/dog --out runs/dog --budget 8m",
     "eval": "gsdmsr eval runs/dog --report --fail-under psnr=22",

@@ -24,6 +24,7 @@ from gsdmsr_cli.cli import (
     doctor,
     export,
     info,
+    make,
     prepare,
     presets,
     render,
@@ -41,8 +42,8 @@ from gsdmsr_cli.ground.streams import unfailing
 # These files import gsdmsr_cli.commands in the functions that run them: torch alone would make
 # --help slow.
 _COMMANDS = (
-    prepare, train, view, evaluate, compare, render, export, info, demo, presets, doctor, weights,
-    cache, benchmark,
+    make, prepare, train, view, evaluate, compare, render, export, info, demo, presets, doctor,
+    weights, cache, benchmark,
 )  # fmt: skip
 """In the order of --help."""
 

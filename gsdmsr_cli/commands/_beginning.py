@@ -13,7 +13,8 @@ from gsdmsr_cli.ground import say
 from gsdmsr_cli.ground.errors import UsageError
 from gsdmsr_cli.ground.locks import sole_writer
 from gsdmsr_cli.options import strict
-from gsdmsr_cli.options.preset import Preset, load_preset
+from gsdmsr_cli.options.preset import Preset, TrainingOptions, load_preset
+from gsdmsr_cli.runs.checkpoints import Checkpoint
 from gsdmsr_cli.runs.outputs import OUTPUTS
 from gsdmsr_cli.runs.run import Run, continue_run, create_run, open_run, refuse_used
 from gsdmsr_cli.runs.seen_pictures import check_whole
@@ -105,12 +106,11 @@ class Resumed:
 
     def _require_rest(self) -> None:
         """Raise UsageError if the training is complete; one that was killed as it ended is not."""
-        clock = new_clock(self.options.training)
-        clock.step, clock.before = self._checkpoint.step, self._checkpoint.elapsed
-        if clock.progress >= 1 and self._earlier.account(clock.step):
+        checkpoint = self._checkpoint
+        if is_complete(self._earlier, checkpoint, self.options.training):
             raise UsageError(
-                f"{self._earlier.root}: is complete at step {clock.step} after "
-                f"{clock.elapsed:.0f} s; give it a longer --budget or more --steps"
+                f"{self._earlier.root}: is complete at step {checkpoint.step} after "
+                f"{checkpoint.elapsed:.0f} s; give it a longer --budget or more --steps"
             )
 
     def suit(self, scene: Scene) -> None:
@@ -135,6 +135,13 @@ class Resumed:
 
 
 Beginning = Anew | Resumed
+
+
+def is_complete(run: Run, checkpoint: Checkpoint, length: TrainingOptions) -> bool:
+    """Return whether a training has ended; one that was killed as it did has not."""
+    clock = new_clock(length)
+    clock.step, clock.before = checkpoint.step, checkpoint.elapsed
+    return clock.progress >= 1 and bool(run.account(clock.step))
 
 
 def _resumed_options(earlier: Run, request: Request) -> Preset:

@@ -12,9 +12,9 @@ from gsdmsr_cli import commands
 from gsdmsr_cli.cli.main import main
 
 COMMANDS = (
-    "prepare", "train", "view", "eval", "compare", "render", "export", "info", "demo", "presets",
-    "doctor", "weights", "cache", "benchmark_kernels", "benchmark_scenes", "benchmark_resume",
-    "benchmark_still", "benchmark_soak", "benchmark_reading",
+    "make", "prepare", "train", "view", "eval", "compare", "render", "export", "info", "demo",
+    "presets", "doctor", "weights", "cache", "benchmark_kernels", "benchmark_scenes",
+    "benchmark_resume", "benchmark_still", "benchmark_soak", "benchmark_reading",
 )  # fmt: skip
 
 
