@@ -13,6 +13,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from gsdmsr_cli.capture.cuts import (
+    Thumbnail,
+    change,
+    find_cuts,
+    longest_shot,
+    thumbnail,
+)
 from gsdmsr_cli.capture.exif import ExifTags, read_exif, upright
 from gsdmsr_cli.capture.source import Source
 from gsdmsr_cli.ground.errors import DataError
@@ -71,6 +78,8 @@ class Frames:
         original_size: before they were shrunk [px].
         focal: focal length that the camera has noted [px], or None.
         blurred: those that were left out because they are blurred.
+        cuts: where the videos have been cut, as a file and seconds in it; only the longest shot
+            was looked at.
     """
 
     folder: Path
@@ -82,6 +91,7 @@ class Frames:
     original_size: tuple[int, int]
     focal: float | None
     blurred: tuple[Candidate, ...]
+    cuts: tuple[tuple[str, float], ...] = ()
 
     @property
     def times(self) -> list[float]:
@@ -104,13 +114,14 @@ def write_frames(
         DataError: a file cannot be read, there are too few frames, or they differ in size.
     """
     survey = _survey_videos if source.kind == "video" else _survey_pictures
-    candidates, in_seconds, tags = survey(source, count, on_progress)
+    candidates, in_seconds, tags, cuts = survey(source, count, on_progress)
     chosen = choose(candidates, count)
     taken, blurred = leave_out_blurred(chosen)
     if len(taken) < LEAST:
+        shot = f", in the longest of {len(cuts) + 1} shots" if cuts else ""
         raise DataError(
-            f"{source.root}: {len(taken)} usable frames of {len(candidates)}; at least {LEAST} are "
-            "needed: film for longer, or give more pictures"
+            f"{source.root}: {len(taken)} usable frames of {len(candidates)}{shot}; at least "
+            f"{LEAST} are needed: film for longer, or give more pictures"
         )
     (folder / PICTURES).mkdir()
     names = tuple(f"{i:05d}.png" for i in range(len(taken)))
@@ -133,6 +144,7 @@ def write_frames(
         {
             "frames": [asdict(frame) for frame in taken],
             "blurred": [asdict(frame) for frame in blurred],
+            "cuts": cuts,
             "of_pictures": source.kind == "images",
             "in_seconds": in_seconds,
             "size": size,
@@ -156,6 +168,7 @@ def read_frames(folder: Path) -> Frames:
         original_size=(note["original_size"][0], note["original_size"][1]),
         focal=note["focal"],
         blurred=tuple(Candidate(**frame) for frame in note["blurred"]),
+        cuts=tuple((file, time) for file, time in note.get("cuts", ())),
     )
 
 
@@ -192,23 +205,38 @@ def sharpness(picture: Picture) -> float:
     return float(cv2.Laplacian(grey, cv2.CV_32F).var())
 
 
-_Survey = tuple[list[Candidate], bool, dict[str, ExifTags]]
+_Cuts = list[tuple[str, float]]
+_Survey = tuple[list[Candidate], bool, dict[str, ExifTags], _Cuts]
 
 
 def _survey_videos(source: Source, count: int, on_progress: OnProgress) -> _Survey:
-    """Return every frame of the videos as a candidate, which follow one another without a gap."""
+    """Return the frames of the longest shot as candidates.
+
+    Videos follow one another without a gap and without a cut.
+    """
     total = sum(video_length(path) for path in source.files)
     candidates: list[Candidate] = []
+    cut_before: list[int] = []
+    cuts: _Cuts = []
     start = 0.0
     for path in source.files:
         before, step = len(candidates), 0.0
+        changes: list[float] = []
+        last: Thumbnail | None = None
         for index, (time, picture) in enumerate(read_video(path)):
             step = start + time - candidates[-1].time if candidates else 0.0
             candidates.append(Candidate(path.name, index, start + time, sharpness(picture)))
+            seen = thumbnail(picture)
+            changes += [] if last is None else [change(last, seen)]
+            last = seen
             on_progress(len(candidates), total + min(count, total))
+        found = [before + index for index in find_cuts(changes)]
+        cuts += [(path.name, candidates[index].time - start) for index in found]
+        cut_before += found
         if len(candidates) - before > 1:
             start = candidates[-1].time + step
-    return candidates, True, {}
+    shot = longest_shot([candidate.time for candidate in candidates], cut_before)
+    return candidates[shot], True, {}, cuts
 
 
 def _survey_pictures(source: Source, count: int, on_progress: OnProgress) -> _Survey:
@@ -223,7 +251,7 @@ def _survey_pictures(source: Source, count: int, on_progress: OnProgress) -> _Su
             time = times[i] - min(times)
             candidates.append(Candidate(source.files[i].name, 0, time, sharp))
             on_progress(len(candidates), len(files) + min(count, len(files)))
-    return candidates, in_seconds, tags
+    return candidates, in_seconds, tags, []
 
 
 def _picture_times(

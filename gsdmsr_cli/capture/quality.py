@@ -68,6 +68,7 @@ def assess(
             "dropped": _dropped(frames, found),
             "parts": [len(part) for part in found.parts],
             "left_out_as_blurred": len(frames.blurred),
+            "cuts": [{"file": file, "seconds": seconds} for file, seconds in frames.cuts],
         },
         "reprojection_px": found.mean_error,
         "points": len(found.points),
@@ -160,6 +161,13 @@ def warnings(report: Mapping[str, Any]) -> list[str]:
         found.append(
             f"{len(frames['dropped'])} of {frames['chosen']} frames have no camera and are left "
             "out: try --matching both, more --frames, or film those parts more slowly"
+        )
+    if frames["cuts"]:
+        told = ", ".join(f"{cut['file']} at {cut['seconds']:.2f} s" for cut in frames["cuts"][:5])
+        more = ", ..." if len(frames["cuts"]) > 5 else ""
+        found.append(
+            f"the video has been cut ({told}{more}) and only its longest shot is taken: to take "
+            "another, give that part as a video of its own"
         )
     if frames["left_out_as_blurred"]:
         found.append(

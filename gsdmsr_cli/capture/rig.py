@@ -146,7 +146,7 @@ def write_rig(
     write_json(
         folder / NOTE,
         {
-            "frames": taken, "blurred": [], "of_pictures": True, "in_seconds": False,
+            "frames": taken, "blurred": [], "cuts": [], "of_pictures": True, "in_seconds": False,
             "size": sizes[0], "original_size": sizes[0], "focal": None,
         },
     )  # fmt: skip

@@ -41,14 +41,19 @@ def frames(of_pictures: bool = False) -> Frames:
     taken = tuple(Candidate(f"film{i}.mp4", 10 * i, float(i)) for i in range(4))
     names = tuple(f"{i:03d}.png" for i in range(4))
     size = WIDTH, HEIGHT
-    return Frames(Path(), names, taken, of_pictures, True, size, size, 75.0, ("b",) * 2)
+    return Frames(
+        Path(), names, taken, of_pictures, True, size, size, 75.0, ("b",) * 2, (("film0.mp4", 1.5),)
+    )
+
+
+CUTS = (("film0.mp4", 1.5),)
 
 
 def test_the_report_of_a_walk() -> None:
     report = assess(frames(), reconstruction(), 0.02, 0.3, "nothing", None)
     assert report["frames"] == {
         "chosen": 4, "registered": 3, "dropped": ["film3.mp4 frame 30"], "parts": [3, 2],
-        "left_out_as_blurred": 2,
+        "left_out_as_blurred": 2, "cuts": [{"file": "film0.mp4", "seconds": 1.5}],
     }  # fmt: skip
     assert report["reprojection_px"] == pytest.approx((3 * 0.4 + 2 * 0.8 + 0.5 + 0.1) / 7)
     assert report["track_length"] == 7 / 4 and report["points"] == 4
@@ -116,7 +121,13 @@ def test_masks_are_told_by_what_they_cover(tmp_path: Path) -> None:
 
 
 SOUND: dict[str, Any] = {
-    "frames": {"chosen": 100, "registered": 95, "dropped": ["x"] * 5, "left_out_as_blurred": 0},
+    "frames": {
+        "chosen": 100,
+        "registered": 95,
+        "dropped": ["x"] * 5,
+        "left_out_as_blurred": 0,
+        "cuts": [],
+    },
     "reprojection_px": 1.0,
     "track_length": 3.5,
     "fewest_points_in_a_frame": 100,
@@ -133,6 +144,7 @@ SOUND: dict[str, Any] = {
 DOUBTFUL = {
     "frames without a camera": ("frames.registered", 94, "5 of 100 frames have no camera"),
     "blurred": ("frames.left_out_as_blurred", 1, "1 frames are far less sharp"),
+    "cut": ("frames.cuts", [{"file": "a.mp4", "seconds": 3.2}], "cut (a.mp4 at 3.20 s)"),
     "off": ("reprojection_px", 1.01, "1.01 px off where they should be seen, more than 1:"),
     "moving": ("moving_matches", 0.11, "11 % of what was found in two frames moves"),
     "turning": ("turning_matches", 0.81, "that only turns explains 81 %"),
