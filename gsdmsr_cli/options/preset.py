@@ -121,6 +121,10 @@ class TrainingOptions:
         tiles_per_view: tiles of 16 x 16 px that are chosen of each, once SSIM does not count any
             more; 0 is all.
         low_resolution_until: progress up to which pictures of half the size are drawn; 0 is never.
+        window: share of the train views that are seen at first, those nearest in time to
+            ``window_at``; the share grows evenly to all of them; 1 sees all from the start.
+        window_until: progress at which all are seen.
+        window_at: the time about which they lie, 0 to 1.
         average_from: progress from which the result is the mean of the steps' values; 1 is never.
         checkpoint_minutes: time between checkpoints [min].
         keep: how many of the last checkpoints are kept.
@@ -137,6 +141,9 @@ class TrainingOptions:
     views_per_step: int = 2
     tiles_per_view: int = 0
     low_resolution_until: float = 0.3
+    window: float = 1.0
+    window_until: float = 0.3
+    window_at: float = 0.5
     average_from: float = 0.9
     checkpoint_minutes: float = 2.0
     keep: int = 1
@@ -152,6 +159,9 @@ class TrainingOptions:
         known = self.budget is None or _duration(self.budget) is not None
         require(self, "budget", known, f"null or {_DURATION}")
         _require_progress(self, "static_until", "low_resolution_until", "average_from")
+        _require_progress(self, "window_until")
+        require(self, "window", 0 < self.window <= 1, "a share above 0, up to 1")
+        require(self, "window_at", 0 <= self.window_at <= 1, "a time from 0 to 1")
         _require_positive(self, "checkpoint_minutes")
         require(self, "seed", 0 <= self.seed < 2**32, "0 to 4294967295")
         _require_at_least(self, 0, "static_steps", "threads", "tiles_per_view")

@@ -36,6 +36,7 @@ from gsdmsr_cli.training.saliency import Saliency
 from gsdmsr_cli.training.schedule import new_clock
 from gsdmsr_cli.training.starting.initial import facts_of, initial_splats
 from gsdmsr_cli.training.timings import Stopwatch
+from gsdmsr_cli.training.window import Window
 
 PENALTY_EVERY = 4
 """Regularisers are slow to change and cost a pass over all planes: every 4th step, 4 times."""
@@ -65,6 +66,7 @@ class Trainer:
         events: what changes the splats after a step, by name, in their order.
         stopwatch: adds up what the time goes into.
         queue: rows of the views that come next, the last one first.
+        window: which of them may be seen yet.
         changing: whether a step is changing the model, or an error has ended such a change.
     """
 
@@ -98,6 +100,7 @@ class Trainer:
         self.clock = new_clock(preset.training)
         self.stopwatch = Stopwatch()
         self.queue: list[int] = []
+        self.window = Window([view.time for view in self.views], preset.training)
         self._times = scene.train_times
         self.changing = False
         self._skipped = 0
@@ -193,14 +196,17 @@ class Trainer:
 
     def _choose_views(self, progress: float) -> list[Order]:
         """Return the views of a step, with all random choices that each needs."""
-        rows = [self._next_row() for _ in range(self.preset.training.views_per_step)]
+        rows = [self._next_row(progress) for _ in range(self.preset.training.views_per_step)]
         return [self._order(row, progress) for row in rows]
 
-    def _next_row(self) -> int:
+    def _next_row(self, progress: float) -> int:
         """Return the next view of a random order that visits every view before any again."""
-        if not self.queue:
-            self.queue = torch.randperm(len(self.views), generator=self.generator).tolist()
-        return self.queue.pop()
+        while True:
+            if not self.queue:
+                self.queue = torch.randperm(len(self.views), generator=self.generator).tolist()
+            row = self.queue.pop()
+            if self.window.shows(row, progress):
+                return row
 
     def _order(self, row: int, progress: float) -> Order:
         view, weights, jitter = self.views[row], None, 0.0

@@ -412,7 +412,7 @@ def test_splats_grow_up_to_the_cap_and_opacities_are_reset(tiny_scene: Path) -> 
 
 def test_a_training_without_splats_gives_up(tiny_scene: Path) -> None:
     trainer = trainer_of(tiny_scene, preset_of("density.prune_opacity=0.999"))
-    with pytest.raises(GsdmsrError, match=r"no splats are left at step 6; lower density\.prune"):
+    with pytest.raises(GsdmsrError, match=r"no splats are left at step 6; if what moves"):
         after(trainer, STEPS)
 
 

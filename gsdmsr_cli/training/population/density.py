@@ -65,8 +65,9 @@ class Density(Event):
         )  # fmt: skip
         if not len(change.rows):
             raise GsdmsrError(
-                f"no splats are left at step {tick.step}; lower density.prune_opacity or "
-                "check that cameras and pictures belong together"
+                f"no splats are left at step {tick.step}; if what moves is small and goes far, "
+                "try --set training.window=0.1; else lower density.prune_opacity, or check that "
+                "cameras and pictures belong together"
             )
         population.statistics.clear()
         return change

@@ -1,0 +1,69 @@
+"""Which views a training may see yet."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from training_checks import preset_of, trainer_of
+
+from gsdmsr_cli.ground.errors import UsageError
+from gsdmsr_cli.options.preset import TrainingOptions
+from gsdmsr_cli.training.window import Window
+
+TIMES = [0.9, 0.1, 0.5, 0.3, 0.7, 0.4]
+
+
+def seen(window: Window, progress: float, count: int = len(TIMES)) -> list[int]:
+    return [row for row in range(count) if window.shows(row, progress)]
+
+
+def test_it_grows_evenly_from_the_views_about_its_moment() -> None:
+    window = Window(TIMES, TrainingOptions(window=1 / 3, window_until=0.4, window_at=0.35))
+    assert seen(window, 0.0) == [3, 5]  # 0.3 and 0.4
+    assert seen(window, 0.1) == [2, 3, 5]
+    assert seen(window, 0.2) == [1, 2, 3, 5]
+    assert seen(window, 0.39) == seen(window, 0.4) == seen(window, 1.0) == [*range(6)]
+
+
+def test_all_are_seen_from_the_start_unless_it_is_asked_for() -> None:
+    assert seen(Window(TIMES, TrainingOptions()), 0.0) == [*range(6)]
+    assert seen(Window(TIMES, TrainingOptions(window=0.1, window_until=0.0)), 0.0) == [*range(6)]
+
+
+@given(
+    st.lists(st.floats(0, 1), min_size=1, max_size=20),
+    st.floats(0.001, 1), st.floats(0, 1), st.floats(0, 1), st.floats(0, 1), st.floats(0, 1),
+)  # fmt: skip
+def test_nearer_views_come_first_and_none_goes_again(
+    times: list[float], first: float, until: float, at: float, one: float, two: float
+) -> None:
+    window = Window(times, TrainingOptions(window=first, window_until=until, window_at=at))
+    before, after = (seen(window, p, len(times)) for p in sorted((one, two)))
+    assert before and set(before) <= set(after)
+    hidden = [abs(t - at) for row, t in enumerate(times) if row not in before]
+    assert not hidden or max(abs(times[row] - at) for row in before) <= min(hidden)
+
+
+def test_a_training_sees_no_other_views(tiny_scene: Path) -> None:
+    options = "training.window=0.25", "training.window_until=1.0", "training.window_at=0.0"
+    trainer = trainer_of(tiny_scene, preset_of(*options))
+    times = sorted(view.time for view in trainer.views)
+    for progress, count in ((0.0, 3), (0.5, 8), (1.0, 12)):
+        rows = {trainer._next_row(progress) for _ in range(200)}
+        assert {trainer.views[row].time for row in rows} == set(times[:count])
+
+
+@pytest.mark.parametrize(
+    ("option", "message"),
+    [
+        ("training.window=0", "window is 0.0; allowed: a share above 0, up to 1"),
+        ("training.window_at=1.5", "window_at is 1.5; allowed: a time from 0 to 1"),
+        ("training.window_until=2", "window_until"),
+    ],
+)
+def test_what_cannot_be_is_refused(option: str, message: str) -> None:
+    with pytest.raises(UsageError, match=message):
+        preset_of(option)
