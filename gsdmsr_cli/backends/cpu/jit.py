@@ -94,7 +94,7 @@ _keep_large_blocks_in_the_heap()
 _load_tbb()
 
 import numba  # noqa: E402  (finds TBB only if that is loaded by now)
-from numba.core.caching import FunctionCache  # noqa: E402
+from numba.core.caching import FunctionCache, IndexDataCacheFile  # noqa: E402
 
 
 def _keep_tbb_loaded() -> None:
@@ -136,8 +136,30 @@ _compiles_here: set[tuple[str, str]] = set()
 """Module and name of the kernel that this process is there to compile."""
 
 
+class Entries(IndexDataCacheFile):  # type: ignore[misc]
+    """Numba's index and files of a kernel, with a file's name made of what it holds.
+
+    Numba numbers the files. Two processes that add to an index at once, one of which may be left
+    of a training that was killed, then take the same number, and the index says of one's code that
+    it is the other's: a kernel for other types, which runs and computes something else.
+    """
+
+    def save(self, key: Any, data: Any) -> None:
+        """Save a kernel, and then that it is there; of two at once one may be forgotten."""
+        told = repr((key, self._source_stamp)).encode()
+        digest = hashlib.sha256(told).hexdigest()[:16]
+        name = self._data_name_pattern.replace("{number:d}", digest)
+        self._save_data(name, data)
+        self._save_index(self._load_index() | {key: name})
+
+
 class _Cache(FunctionCache):  # type: ignore[misc]
     """Numba's cache on disk, which has what is missing compiled by another process."""
+
+    def __init__(self, kernel: Callable[..., Any]) -> None:
+        super().__init__(kernel)
+        stamp = self._impl.locator.get_source_stamp()
+        self._cache_file = Entries(self._cache_path, self._impl.filename_base, stamp)
 
     def load_overload(self, signature: Any, target: Any) -> Any:
         """Return the compiled kernel, or None where this process has to compile it itself."""

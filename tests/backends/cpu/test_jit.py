@@ -11,6 +11,8 @@ from pathlib import Path
 
 import pytest
 
+from gsdmsr_cli.backends.cpu.jit import Entries
+
 FOLDER = "import numba; from gsdmsr_cli.backends.cpu import jit; print(numba.config.CACHE_DIR)"
 
 
@@ -112,3 +114,20 @@ def test_a_process_on_one_core_ends(last: str) -> None:
     for _ in "12":
         done = subprocess.run([sys.executable, "-c", code], check=False, timeout=120)
         assert done.returncode == 0
+
+
+def test_two_that_add_to_a_cache_at_once_never_get_each_others_code(tmp_path: Path) -> None:
+    """As one left of a killed training does beside another: it comes between index and file."""
+    one, two = (Entries(str(tmp_path), "kernel", (1.0, 2)) for _ in range(2))
+    before, write = two._load_index(), one._save_data
+
+    def write_late(name: str, data: str) -> None:
+        two._load_index = lambda: dict(before)  # which it has read already
+        two.save(("two",), "code of two")
+        write(name, data)
+
+    one._save_data = write_late
+    one.save(("one",), "code of one")
+    found = Entries(str(tmp_path), "kernel", (1.0, 2))
+    assert found.load(("two",)) == "code of two" and found.load(("one",)) == "code of one"
+    assert Entries(str(tmp_path), "kernel", (1.0, 3)).load(("one",)) is None  # other sources
