@@ -11,6 +11,7 @@ from __future__ import annotations
 import ctypes
 import hashlib
 import importlib
+import itertools
 import os
 import pickle
 import sys
@@ -94,6 +95,7 @@ _keep_large_blocks_in_the_heap()
 _load_tbb()
 
 import numba  # noqa: E402  (finds TBB only if that is loaded by now)
+from numba.core.bytecode import FunctionIdentity  # noqa: E402
 from numba.core.caching import FunctionCache, IndexDataCacheFile  # noqa: E402
 
 
@@ -221,9 +223,21 @@ def compile_one(asked: bytes) -> None:
             empty = ModuleType(f"{PACKAGE.name}.ops.{folder.name}")
             empty.__path__ = [str(folder)]
             sys.modules[empty.__name__] = empty
+    _take_names_of_its_own(asked)
     module, name, signature = pickle.loads(asked)
     _compiles_here.add((module, name))
     getattr(importlib.import_module(module), name).compile(signature)
+
+
+def _take_names_of_its_own(asked: bytes) -> None:
+    """Let no other process give the same names to the parts of what is compiled here.
+
+    Numba names the loops of a kernel by an address and a count, which forks of one process have in
+    common. Of two forms of a kernel whose loops have the same name, such as for three channels and
+    for four, whoever loads both runs the loops of the first for either.
+    """
+    first = int(hashlib.sha256(asked).hexdigest()[:12], 16)
+    FunctionIdentity._unique_ids = itertools.count(first)
 
 
 def _kept(compiled: Any) -> Any:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
@@ -98,6 +99,7 @@ resource.setrlimit(resource.RLIMIT_FSIZE, (0, 0))
 
 ON_ONE_CORE = """
 import os
+import re
 os.sched_setaffinity(0, [min(os.sched_getaffinity(0))])
 import torch
 from gsdmsr_cli.ops.nearest import nearest_points
@@ -131,3 +133,23 @@ def test_two_that_add_to_a_cache_at_once_never_get_each_others_code(tmp_path: Pa
     found = Entries(str(tmp_path), "kernel", (1.0, 2))
     assert found.load(("two",)) == "code of two" and found.load(("one",)) == "code of one"
     assert Entries(str(tmp_path), "kernel", (1.0, 3)).load(("one",)) is None  # other sources
+
+
+THREE_AND_FOUR_CHANNELS = """
+import numpy as np
+from gsdmsr_cli.ops.series.cpu import add
+
+for channels in 3, 4:
+    start, found = np.zeros((2, channels), np.float32), np.zeros((2, channels), np.float32)
+    coefficients, basis = np.ones((2, 1, channels), np.float32), np.ones((2, 1), np.float32)
+    add(start, coefficients, basis, np.float32(1), 0, (0,) * channels, found)
+    assert (found == 1).all(), found
+print("[]")
+"""
+
+
+def test_no_two_forms_of_a_kernel_have_a_name_in_common(tmp_path: Path) -> None:
+    compiled_in(tmp_path, THREE_AND_FOUR_CHANNELS)
+    forms = [file.read_bytes() for file in tmp_path.rglob("cpu.add-*.nbc")]
+    loops = [set(re.findall(rb"numba_parfor_gufunc_0x[0-9a-f]+(B\d+v\d+)", form)) for form in forms]
+    assert len(loops) == 2 and all(loops) and not loops[0] & loops[1]
