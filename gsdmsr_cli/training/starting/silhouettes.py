@@ -7,22 +7,14 @@ from torch import Tensor
 
 from gsdmsr_cli.scene.pictures import Pictures
 from gsdmsr_cli.scene.scene import Scene
-from gsdmsr_cli.training.starting.sightings import Points, at_unknown_times, places
+from gsdmsr_cli.training.starting.outlines import outlines
+from gsdmsr_cli.training.starting.sightings import Points, at_unknown_times
 
 CANDIDATES, MOST_CANDIDATES = 20, 500_000
 """Random points per point wanted, and how many at most, for the sake of memory."""
 
 SHARPNESS = 4.0
 """Points are drawn with the probability of their share of silhouettes to this power."""
-
-DIFFERENCE = 8
-"""A pixel belongs to the silhouette if a channel differs this much from the background [1/255]."""
-
-VIEWS = 100
-"""Most views that are read, evenly spaced."""
-
-GRID = 100
-"""Pictures are sampled at about so many pixels along a side, enough for a first guess."""
 
 
 def sample_points(
@@ -44,20 +36,12 @@ def sample_points(
     candidates = (2 * torch.rand(tried, 3, generator=generator) - 1) * scene.bound
     inside, seen = torch.zeros(len(candidates)), torch.zeros(len(candidates))
     colours = torch.zeros(len(candidates), 3)
-    plain = (background * 255).round()
-    views = scene.split("train")
-    for view in views[:: -(-len(views) // VIEWS)]:
-        picture, camera = pictures.load(view), pictures.camera(view)
-        stride = max(1, min(picture.shape[1:]) // GRID)
-        pixels = picture[:, ::stride, ::stride].permute(1, 2, 0).float()
-        drawn = (pixels - plain).abs().amax(dim=2) > DIFFERENCE
-        across, down, visible = places(candidates, camera)
-        column = (across / stride).long().clamp(0, drawn.shape[1] - 1)
-        row = (down / stride).long().clamp(0, drawn.shape[0] - 1)
-        hit = visible & drawn[row, column]
+    for outline in outlines(scene, pictures, background):
+        row, column, visible = outline.cells(candidates)
+        hit = visible & outline.drawn[row, column]
         seen += visible
         inside += hit
-        colours += pixels[row, column] / 255 * hit[:, None]
+        colours += outline.pixels[row, column] / 255 * hit[:, None]
     share = (inside / seen.clamp(min=1)).clamp(min=1e-3)
     rows = torch.multinomial(share.pow(SHARPNESS), count, replacement=True, generator=generator)
     # a small thing holds fewer candidates than points, so the points spread around them
