@@ -58,7 +58,7 @@ def run(request: Request) -> None:
         scene, load_s = _timed(lambda: _read(request))
         beginning.suit(scene)
         trainer, prepare_s = _timed(lambda: _prepare(scene, beginning.options, device))
-        for text in trainer.renderer.notes:
+        for text in trainer.notes:
             say.note(text)
         if request.dry_run:
             require_apart(request.out, scene)

@@ -123,6 +123,8 @@ class TrainingOptions:
         low_resolution_until: progress up to which pictures of half the size are drawn; 0 is never.
         window: share of the train views that are seen at first, those nearest in time to
             ``window_at``; the share grows evenly to all of them; 1 sees all from the start.
+        window_if: when that is so: always, or if something lies apart in the train views from all
+            that stands, see ``training.starting.apart``.
         window_until: progress at which all are seen.
         window_at: the time about which they lie, 0 to 1.
         average_from: progress from which the result is the mean of the steps' values; 1 is never.
@@ -142,6 +144,7 @@ class TrainingOptions:
     tiles_per_view: int = 0
     low_resolution_until: float = 0.3
     window: float = 1.0
+    window_if: Literal["always", "apart"] = "always"
     window_until: float = 0.3
     window_at: float = 0.5
     average_from: float = 0.9

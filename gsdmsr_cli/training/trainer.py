@@ -36,7 +36,7 @@ from gsdmsr_cli.training.saliency import Saliency
 from gsdmsr_cli.training.schedule import new_clock
 from gsdmsr_cli.training.starting.initial import facts_of, initial_splats
 from gsdmsr_cli.training.timings import Stopwatch
-from gsdmsr_cli.training.window import Window
+from gsdmsr_cli.training.window import start_window
 
 PENALTY_EVERY = 4
 """Regularisers are slow to change and cost a pass over all planes: every 4th step, 4 times."""
@@ -67,6 +67,7 @@ class Trainer:
         stopwatch: adds up what the time goes into.
         queue: rows of the views that come next, the last one first.
         window: which of them may be seen yet.
+        notes: what to say to who trains.
         changing: whether a step is changing the model, or an error has ended such a change.
     """
 
@@ -100,7 +101,8 @@ class Trainer:
         self.clock = new_clock(preset.training)
         self.stopwatch = Stopwatch()
         self.queue: list[int] = []
-        self.window = Window([view.time for view in self.views], preset.training)
+        self.window = start_window(scene, pictures, background, preset.training)
+        self.notes = [*self.renderer.notes, *filter(None, [self.window.note])]
         self._times = scene.train_times
         self.changing = False
         self._skipped = 0

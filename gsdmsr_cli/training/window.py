@@ -10,8 +10,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
+
+from torch import Tensor
 
 from gsdmsr_cli.options.preset import TrainingOptions
+from gsdmsr_cli.scene.pictures import Pictures
+from gsdmsr_cli.scene.scene import Scene
+from gsdmsr_cli.training.starting.apart import views_with_things_apart
+
+FEW = 0.05
+"""Share of the views that may show something apart by chance."""
 
 
 class Window:
@@ -20,7 +29,12 @@ class Window:
     Args:
         times: of all train views, in [0, 1].
         options: see ``window``, ``window_until`` and ``window_at`` there.
+
+    Attributes:
+        note: why not all views are seen from the start, to be said to who trains, if so.
     """
+
+    note: str | None = None
 
     def __init__(self, times: Sequence[float], options: TrainingOptions) -> None:
         self._options = options
@@ -35,3 +49,26 @@ class Window:
         first, until = self._options.window, self._options.window_until
         grown = min(1.0, progress / until) if until > 0 else 1.0
         return max(1, math.ceil((first + (1 - first) * grown) * len(self._place)))
+
+
+def start_window(
+    scene: Scene, pictures: Pictures, background: Tensor, options: TrainingOptions
+) -> Window:
+    """Return the window that the options want for the train views of a scene.
+
+    Args:
+        scene: gives views and box.
+        pictures: the train pictures, composited on ``background`` (3,).
+    """
+    times = [view.time for view in scene.split("train")]
+    if options.window == 1 or options.window_if == "always":
+        return Window(times, options)
+    share = views_with_things_apart(scene, pictures, background)
+    if share <= FEW:
+        return Window(times, replace(options, window=1.0))
+    window = Window(times, options)
+    window.note = (
+        f"in {share:.0%} of the train views something lies apart from all that stands: those about "
+        f"time {options.window_at:g} are seen first (training.window)"
+    )
+    return window

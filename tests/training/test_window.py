@@ -5,13 +5,15 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+import torch
+from balls import Album, cameras, scene_of
 from hypothesis import given
 from hypothesis import strategies as st
 from training_checks import preset_of, trainer_of
 
 from gsdmsr_cli.ground.errors import UsageError
 from gsdmsr_cli.options.preset import TrainingOptions
-from gsdmsr_cli.training.window import Window
+from gsdmsr_cli.training.window import Window, start_window
 
 TIMES = [0.9, 0.1, 0.5, 0.3, 0.7, 0.4]
 
@@ -49,7 +51,7 @@ def test_nearer_views_come_first_and_none_goes_again(
 
 def test_a_training_sees_no_other_views(tiny_scene: Path) -> None:
     options = "training.window=0.25", "training.window_until=1.0", "training.window_at=0.0"
-    trainer = trainer_of(tiny_scene, preset_of(*options))
+    trainer = trainer_of(tiny_scene, preset_of(*options, "training.window_if=always"))
     times = sorted(view.time for view in trainer.views)
     for progress, count in ((0.0, 3), (0.5, 8), (1.0, 12)):
         rows = {trainer._next_row(progress) for _ in range(200)}
@@ -67,3 +69,24 @@ def test_a_training_sees_no_other_views(tiny_scene: Path) -> None:
 def test_what_cannot_be_is_refused(option: str, message: str) -> None:
     with pytest.raises(UsageError, match=message):
         preset_of(option)
+
+
+@pytest.mark.parametrize(
+    ("share", "seen_at_first", "told"), [(0.0, 16, False), (0.05, 16, False), (0.11, 4, True)]
+)
+def test_if_apart_it_depends_on_what_the_views_show(
+    share: float, seen_at_first: int, told: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("gsdmsr_cli.training.window.views_with_things_apart", lambda *_: share)
+    shots = cameras(16, 16)
+    options = TrainingOptions(window=0.25, window_if="apart")
+    window = start_window(scene_of(shots), Album([]), torch.ones(3), options)
+    assert len(seen(window, 0.0, 16)) == seen_at_first
+    assert (window.note is not None) == told
+    assert not told or "in 11% of the train views" in str(window.note)
+
+
+def test_always_asks_nothing_of_the_pictures() -> None:
+    options = TrainingOptions(window=0.25, window_if="always")
+    window = start_window(scene_of(cameras(16, 16)), Album([]), torch.ones(3), options)
+    assert len(seen(window, 0.0, 16)) == 4 and window.note is None

@@ -66,8 +66,8 @@ class Density(Event):
         if not len(change.rows):
             raise GsdmsrError(
                 f"no splats are left at step {tick.step}; if what moves is small and goes far, "
-                "try --set training.window=0.1; else lower density.prune_opacity, or check that "
-                "cameras and pictures belong together"
+                "try --set training.window=0.1 --set training.window_if=always; else lower "
+                "density.prune_opacity, or check that cameras and pictures belong together"
             )
         population.statistics.clear()
         return change
