@@ -172,6 +172,16 @@ class Model:
         for layer in self.layers.values():
             layer.advance(progress)
 
+    def hold_outside(self, first: float, last: float) -> None:
+        """Let the layers be, at times that no view has shown yet, as at the nearest shown.
+
+        Args:
+            first, last: the times within which views have been shown. What has no values of single
+                times, such as a polynomial, is not changed.
+        """
+        for parameter in self.parameters():
+            parameter.hold_outside(first, last)
+
     def penalty(self, instant: Instant, generator: torch.Generator) -> Tensor | None:
         """Return the sum of the layers' regularisers at ``instant``, or None if there are none."""
         total: Tensor | None = None

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Protocol
 
 import torch
@@ -12,6 +14,8 @@ from torch import Tensor
 Rate = str | tuple[float, float]
 """A learning rate: the name of one of the preset's (a field of ``OptimizerOptions``), or its own
 values at the start and at the end of a training, log-linear in between."""
+
+NO_TIMES: Mapping[str, int] = MappingProxyType({})
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,6 +32,7 @@ class Parameter:
         rate: the learning rate that it follows; None for a buffer, of any dtype, that is saved but
             not trained.
         fill: value of a row that is new: of a splat that has stood still and begins to move.
+        time_axis: the dimension whose entries belong to times, evenly from 0 to 1, if there is one.
     """
 
     name: str
@@ -35,6 +40,7 @@ class Parameter:
     per_splat: bool = False
     rate: Rate | None = None
     fill: float = 0.0
+    time_axis: int | None = None
 
     def __post_init__(self) -> None:
         self.tensor.requires_grad_(self.rate is not None)
@@ -47,6 +53,19 @@ class Parameter:
     def take(self, rows: Tensor) -> None:
         """Make row i what row ``rows[i]`` was, (M,) int64; a new one where there was none such."""
         self.set_values(take_rows(self.tensor.detach(), rows, self.fill))
+
+    def hold_outside(self, first: float, last: float) -> None:
+        """Give times outside of [first, last] the values of the nearest that count within it.
+
+        Without a time axis nothing changes.
+        """
+        if self.time_axis is None:
+            return
+        values = self.tensor.detach().movedim(self.time_axis, 0)
+        end = len(values) - 1
+        lower, upper = math.floor(first * end), math.ceil(last * end)
+        values[:lower] = values[lower].clone()
+        values[upper + 1 :] = values[upper].clone()
 
 
 def take_rows(tensor: Tensor, rows: Tensor, fill: float) -> Tensor:
@@ -68,10 +87,19 @@ class Part(Protocol):
     def _asdict(self) -> Mapping[str, Tensor]: ...
 
 
-def name_parameters(name: str, parts: Sequence[Part], rate: Rate) -> list[Parameter]:
-    """Return a grid's levels or a network's layers as parameters "name.0.space" and so on."""
+def name_parameters(
+    name: str, parts: Sequence[Part], rate: Rate, time_axes: Mapping[str, int] = NO_TIMES
+) -> list[Parameter]:
+    """Return a grid's levels or a network's layers as parameters "name.0.space" and so on.
+
+    Args:
+        name: of all of them.
+        parts: the levels or layers.
+        rate: the learning rate that all follow.
+        time_axes: dimensions that run over times, by the names of the parts' fields.
+    """
     return [
-        Parameter(f"{name}.{index}.{field}", tensor, rate=rate)
+        Parameter(f"{name}.{index}.{field}", tensor, rate=rate, time_axis=time_axes.get(field))
         for index, part in enumerate(parts)
         for field, tensor in part._asdict().items()
     ]

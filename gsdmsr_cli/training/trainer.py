@@ -187,7 +187,7 @@ class Trainer:
             raise
 
     def _enter_phase(self, progress: float) -> None:
-        """Drop splats that are not finite, and start the motion after the static phase."""
+        """Drop splats that are not finite, start the motion, hold what has not been seen."""
         if self.device.type == "cpu":  # a GPU is not waited for: there it is done at reports
             self.population.drop_not_finite()
         options = self.preset.training
@@ -195,6 +195,8 @@ class Trainer:
         if over and not self.population.moving:
             self.population.begin_moving()
         self.model.advance(progress)
+        if extent := self.window.extent(progress):
+            self.model.hold_outside(*extent)
 
     def _choose_views(self, progress: float) -> list[Order]:
         """Return the views of a step, with all random choices that each needs."""

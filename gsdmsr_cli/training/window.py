@@ -3,7 +3,8 @@
 What moves farther than its own size is a smear in the mean over all moments, and where it is seen
 against a plain background it is worth nothing there: its splats turn transparent, and nothing is
 left to learn a motion. In a short time about one moment it hardly moves. From there on it is
-followed, as the window grows.
+followed, as the window grows: times that no view has shown yet are held at the nearest one that has
+been, so that what comes next is near where it is looked for.
 """
 
 from __future__ import annotations
@@ -40,10 +41,18 @@ class Window:
         self._options = options
         nearest = sorted(range(len(times)), key=lambda row: abs(times[row] - options.window_at))
         self._place = {row: place for place, row in enumerate(nearest)}
+        self._times = [times[row] for row in nearest]
 
     def shows(self, row: int, progress: float) -> bool:
         """Return whether a view may be seen; there always is one at least that may."""
         return self._place[row] < self._count(progress)
+
+    def extent(self, progress: float) -> tuple[float, float] | None:
+        """Return the first and the last time that may be seen, or None if all may."""
+        count = self._count(progress)
+        if count == len(self._times):
+            return None
+        return min(self._times[:count]), max(self._times[:count])
 
     def _count(self, progress: float) -> int:
         first, until = self._options.window, self._options.window_until

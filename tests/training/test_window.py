@@ -49,6 +49,38 @@ def test_nearer_views_come_first_and_none_goes_again(
     assert not hidden or max(abs(times[row] - at) for row in before) <= min(hidden)
 
 
+def test_extent_is_that_of_the_times_that_are_seen() -> None:
+    window = Window(TIMES, TrainingOptions(window=0.5, window_until=1.0, window_at=0.5))
+    assert window.extent(0.0) == (0.4, 0.7)
+    assert window.extent(0.5) == (0.3, 0.9) and window.extent(1.0) is None
+    assert Window(TIMES, TrainingOptions()).extent(0.0) is None
+
+
+def test_a_training_holds_what_it_has_not_seen_and_nothing_later(tiny_scene: Path) -> None:
+    options = "training.window=0.25", "training.window_until=0.5", "training.window_at=0.0"
+    wanted = preset_of(
+        *options, "training.window_if=always", "training.static_until=0", "training.steps=20"
+    )
+    trainer = trainer_of(tiny_scene, wanted)
+    grids = [p for p in trainer.model.parameters() if p.time_axis is not None]
+    assert grids
+    with torch.no_grad():
+        for grid in grids:
+            grid.tensor.copy_(torch.rand(grid.tensor.shape, generator=torch.Generator()))
+    trainer._enter_phase(0.0)
+    for grid in grids:
+        at = grid.tensor.detach().movedim(grid.time_axis or 0, 0)
+        assert torch.equal(at[-1], at[-2]) and not torch.equal(at[0], at[-1])
+    kept = [grid.tensor.detach().clone() for grid in grids]
+    with torch.no_grad():
+        for grid in grids:
+            grid.tensor.add_(torch.rand(grid.tensor.shape, generator=torch.Generator()))
+    changed = [grid.tensor.detach().clone() for grid in grids]
+    trainer._enter_phase(0.5)
+    for grid, now, before in zip(grids, changed, kept, strict=True):
+        assert torch.equal(grid.tensor.detach(), now) and not torch.equal(now, before)
+
+
 def test_a_training_sees_no_other_views(tiny_scene: Path) -> None:
     options = "training.window=0.25", "training.window_until=1.0", "training.window_at=0.0"
     trainer = trainer_of(tiny_scene, preset_of(*options, "training.window_if=always"))

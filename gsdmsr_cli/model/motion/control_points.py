@@ -74,7 +74,7 @@ class ControlPointMotion(ControlPoints):
         widths = [options.channels * len(options.levels), options.width, options.width, OUTPUTS]
         self.layers = network.new_network(widths, generator)
         self._parameters += (
-            *name_parameters("grid", self.levels, "planes"),
+            *name_parameters("grid", self.levels, "planes", planes.TIME_AXES),
             *name_parameters("network", self.layers, "network"),
         )
 

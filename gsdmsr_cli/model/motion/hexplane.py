@@ -68,7 +68,7 @@ class HexPlaneMotion(Layer):
         blocks = [torch.ones(options.width, outputs) for outputs in PARTS]
         self._own = torch.block_diag(*blocks) if separate else None
         super().__init__(
-            name_parameters("grid", self.levels, "planes")
+            name_parameters("grid", self.levels, "planes", planes.TIME_AXES)
             + name_parameters("network", self.layers, "network")
         )
 

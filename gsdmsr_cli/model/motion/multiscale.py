@@ -109,8 +109,8 @@ class MultiscaleMotion(Layer):
 
     def _named(self) -> list[Parameter]:
         parameters = (
-            name_parameters("coarse", self.coarse, "planes")
-            + name_parameters("fine", self.fine, "planes")
+            name_parameters("coarse", self.coarse, "planes", planes.TIME_AXES)
+            + name_parameters("fine", self.fine, "planes", planes.TIME_AXES)
             + name_parameters("coarse_decoder", self.coarse_decoder, "network")
             + name_parameters("decoder", self.decoder, "network")
         )

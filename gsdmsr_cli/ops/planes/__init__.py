@@ -20,6 +20,7 @@ from gsdmsr_cli.ops.planes import cpu as kernels
 from gsdmsr_cli.ops.planes import cuda
 from gsdmsr_cli.ops.planes.levels import (
     CUBE,
+    TIME_AXES,
     Box,
     Corner,
     Level,
@@ -32,6 +33,7 @@ from gsdmsr_cli.ops.planes.twin import lookup_twin, penalty_twin
 
 __all__ = [
     "CUBE",
+    "TIME_AXES",
     "Box",
     "Corner",
     "Level",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
@@ -34,6 +35,10 @@ class Level(NamedTuple):
     def channels(self) -> int:
         """Number of features the level adds."""
         return int(self.space.shape[1]) * LANES
+
+
+TIME_AXES = MappingProxyType({"time": 2})
+"""Which dimension of a level's tensors runs over times, by their names."""
 
 
 def new_level(resolution: int, times: int, channels: int, generator: torch.Generator) -> Level:

@@ -127,6 +127,26 @@ def test_several_times_at_once_are_those_times_to_the_last_bit(name: str) -> Non
 
 
 @every_motion
+def test_holding_what_is_not_shown_changes_nothing_that_is(name: str) -> None:
+    motion, splats = disturbed(started(name, COUNT)), splats_of(COUNT)
+    model = model_of(splats, motion)
+    before = [moved_by(motion, splats, time) for time in (0.4, 0.5, 0.6)]
+    model.hold_outside(0.4, 0.6)
+    for time, expected in zip((0.4, 0.5, 0.6), before, strict=True):
+        assert_equal(moved_by(motion, splats, time), expected, rtol=1e-5, atol=1e-6)
+
+
+@every_grid
+def test_grids_stand_still_at_times_that_are_not_shown(name: str) -> None:
+    motion, splats = disturbed(started(name, COUNT)), splats_of(COUNT)
+    model_of(splats, motion).hold_outside(0.4, 0.6)
+    for ends in ((0.8, 1.0), (0.0, 0.2)):
+        one, other = (moved_by(motion, splats, time) for time in ends)
+        assert_equal(one, other, rtol=1e-5, atol=1e-6)
+    assert not torch.allclose(one.means, moved_by(motion, splats, 0.6).means)
+
+
+@every_motion
 def test_moves_once_it_has_learnt(name: str) -> None:
     """So that the other tests compare something; only ``static`` has nothing to learn."""
     splats = splats_of(COUNT)
