@@ -122,7 +122,8 @@ class TrainingOptions:
             more; 0 is all.
         low_resolution_until: progress up to which pictures of half the size are drawn; 0 is never.
         window: share of the train views that are seen at first, those nearest in time to
-            ``window_at``; the share grows evenly to all of them; 1 sees all from the start.
+            ``window_at``; from ``static_until`` on it grows evenly to all of them; 1 sees all from
+            the start.
         window_if: when that is so: always, or if something lies apart in the train views from all
             that stands, see ``training.starting.apart``.
         window_until: progress at which all are seen.

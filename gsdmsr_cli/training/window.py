@@ -56,7 +56,9 @@ class Window:
 
     def _count(self, progress: float) -> int:
         first, until = self._options.window, self._options.window_until
-        grown = min(1.0, progress / until) if until > 0 else 1.0
+        since = min(self._options.static_until, until)  # what stands still cannot follow
+        grown = (progress - since) / (until - since) if until > since else progress >= until
+        grown = min(1.0, max(0.0, grown))
         return max(1, math.ceil((first + (1 - first) * grown) * len(self._place)))
 
 

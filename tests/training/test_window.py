@@ -23,11 +23,12 @@ def seen(window: Window, progress: float, count: int = len(TIMES)) -> list[int]:
 
 
 def test_it_grows_evenly_from_the_views_about_its_moment() -> None:
-    window = Window(TIMES, TrainingOptions(window=1 / 3, window_until=0.4, window_at=0.35))
-    assert seen(window, 0.0) == [3, 5]  # 0.3 and 0.4
-    assert seen(window, 0.1) == [2, 3, 5]
-    assert seen(window, 0.2) == [1, 2, 3, 5]
-    assert seen(window, 0.39) == seen(window, 0.4) == seen(window, 1.0) == [*range(6)]
+    options = TrainingOptions(window=1 / 3, window_until=0.5, window_at=0.35, static_until=0.1)
+    window = Window(TIMES, options)
+    assert seen(window, 0.0) == seen(window, 0.1) == [3, 5]  # 0.3 and 0.4
+    assert seen(window, 0.2) == [2, 3, 5]
+    assert seen(window, 0.3) == [1, 2, 3, 5]
+    assert seen(window, 0.49) == seen(window, 0.5) == seen(window, 1.0) == [*range(6)]
 
 
 def test_all_are_seen_from_the_start_unless_it_is_asked_for() -> None:
@@ -52,6 +53,7 @@ def test_nearer_views_come_first_and_none_goes_again(
 def test_extent_is_that_of_the_times_that_are_seen() -> None:
     window = Window(TIMES, TrainingOptions(window=0.5, window_until=1.0, window_at=0.5))
     assert window.extent(0.0) == (0.4, 0.7)
+    assert window.extent(0.04) == (0.4, 0.7), "nothing moves before 0.04"
     assert window.extent(0.5) == (0.3, 0.9) and window.extent(1.0) is None
     assert Window(TIMES, TrainingOptions()).extent(0.0) is None
 
@@ -83,7 +85,8 @@ def test_a_training_holds_what_it_has_not_seen_and_nothing_later(tiny_scene: Pat
 
 def test_a_training_sees_no_other_views(tiny_scene: Path) -> None:
     options = "training.window=0.25", "training.window_until=1.0", "training.window_at=0.0"
-    trainer = trainer_of(tiny_scene, preset_of(*options, "training.window_if=always"))
+    further = "training.window_if=always", "training.static_until=0"
+    trainer = trainer_of(tiny_scene, preset_of(*options, *further))
     times = sorted(view.time for view in trainer.views)
     for progress, count in ((0.0, 3), (0.5, 8), (1.0, 12)):
         rows = {trainer._next_row(progress) for _ in range(200)}
