@@ -14,6 +14,9 @@ def small_report() -> dict[str, Any]:
         "ssim": 0.91,
         "ms_ssim": {"value": 0.95, "reason": None, "searched": []},
         "lpips_alex": missing,
+        "flicker": {"value": 0.0213, "reason": None, "searched": []},
+        "flicker_true": {"value": 0.0125, "reason": None, "searched": []},
+        "flicker_excess": {"value": 0.0088, "reason": None, "searched": []},
     }
     frames = [
         {"name": "r_000", "time": 0.0, "psnr": 25.123456, "ssim": 0.9, "ms_ssim": 0.94},

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from typing import Any
 
 from gsdmsr_cli.backends.cuda import availability
@@ -10,6 +11,7 @@ from gsdmsr_cli.commands._progress import part_of, progress_bar
 from gsdmsr_cli.commands._trained import Trained
 from gsdmsr_cli.evaluation import protocol
 from gsdmsr_cli.evaluation.catalogue import PARTS, Metric, load_metrics
+from gsdmsr_cli.evaluation.flicker import Flicker, consecutive, figures, measure_flicker
 from gsdmsr_cli.evaluation.lpips import weights_hashes
 from gsdmsr_cli.evaluation.metrics import Missing
 from gsdmsr_cli.evaluation.request import BOTH, Request
@@ -47,19 +49,21 @@ def measure(trained: Trained, request: Request) -> dict[str, Any]:
         (split, renderer, own, metrics if split == request.split else {})
         for split, own in chosen.items()
     ]
-    work += [(name, renderer.over(BACKGROUNDS[name]), views, metrics) for name in others]
+    over = {name: renderer.over(BACKGROUNDS[name]) for name in others}
+    work += [(name, renderer, views, metrics) for name, renderer in over.items()]
     scored = _score_all(work)
+    flicker = _flicker_over({request.split: renderer, **over}, views, trained.scene.views)
     shots = list(zip(cameras, (view.time for view in views), strict=True))
     speed = measure_speed(renderer.model, shots, renderer.engine, renderer.background)
     return {
         "schema": SCHEMA,
         "protocol": describe(trained, request),
-        **_results(scored[request.split], metrics),
+        **_results(scored[request.split], metrics, flicker[request.split]),
         "splits": {
             split: {"psnr": _mean(scored[split])["psnr"], "frames": len(own)}
             for split, own in chosen.items()
         },
-        "backgrounds": {name: _results(scored[name], metrics) for name in others},
+        "backgrounds": {name: _results(scored[name], metrics, flicker[name]) for name in others},
         "speed": speed.document(),
         "storage": {
             "checkpoint_bytes": trained.checkpoint.file_bytes,
@@ -78,6 +82,21 @@ def _score_all(work: Sequence[_Task]) -> dict[str, Scored]:
             of_all = part_of(on_progress, sum(map(len, scored.values())), total)
             scored[name] = protocol.score_views(renderer, views, metrics, of_all)
     return scored
+
+
+def _flicker_over(
+    renderers: Mapping[str, protocol.ViewRenderer], views: Sequence[View], scene: Sequence[View]
+) -> dict[str, Flicker | Missing]:
+    """Return the flicker of the views and their neighbours, by the names of the renderers."""
+    pairs = consecutive(views, scene)
+    if isinstance(pairs, Missing):
+        return dict.fromkeys(renderers, pairs)
+    found, total = dict[str, Flicker | Missing](), len(renderers) * len(pairs)
+    with progress_bar("comparing consecutive pictures") as on_progress:
+        for name, renderer in renderers.items():
+            of_all = part_of(on_progress, len(found) * len(pairs), total)
+            found[name] = measure_flicker(renderer, pairs, of_all)
+    return found
 
 
 def _backgrounds(trained: Trained, request: Request) -> list[str]:
@@ -135,12 +154,16 @@ def describe(trained: Trained, request: Request) -> dict[str, Any]:
     }
 
 
-def _results(scored: Scored, metrics: Mapping[str, Metric | Missing]) -> dict[str, Any]:
+def _results(
+    scored: Scored, metrics: Mapping[str, Metric | Missing], flicker: Flicker | Missing
+) -> dict[str, Any]:
     """Return what has come out over one background: the aggregate and every frame."""
     counts = {part: sum(f"psnr_{part}" in scores for _, scores in scored) for part in PARTS}
+    known = {} if isinstance(flicker, Missing) else asdict(flicker)
     return {
-        "aggregate": protocol.with_reasons(_mean(scored), metrics),
+        "aggregate": {**protocol.with_reasons(_mean(scored), metrics), **figures(flicker)},
         "parts": {part: {"frames": count} for part, count in counts.items() if count},
+        "consecutive": {key: known.get(key, 0) for key in ("pairs", "pixels")},
         "frames": [{"name": view.name, "time": view.time, **scores} for view, scores in scored],
     }
 

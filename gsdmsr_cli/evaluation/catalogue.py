@@ -22,7 +22,17 @@ _LPIPS_INRIA = tuple(f"lpips_{net}_inria" for net in PUBLISHED)
 WHOLE = ("psnr", "psnr_float", "ssim", "ms_ssim", *_LPIPS, *_LPIPS_INRIA)
 """Metrics of whole pictures."""
 
-METRICS = (*WHOLE, *(f"{metric}_{part}" for part in PARTS for metric in ("psnr", "ssim")))
+FLICKER = ("flicker", "flicker_true", "flicker_excess")
+"""Of consecutive pictures: of the drawn ones, of the true ones, and by how much it is more."""
+
+OF_TRUTH = ("flicker_true",)
+"""Metrics of the true pictures alone, beside which others are read; no run is better by them."""
+
+METRICS = (
+    *WHOLE,
+    *FLICKER,
+    *(f"{metric}_{part}" for part in PARTS for metric in ("psnr", "ssim")),
+)
 """All metrics, in the order of tables."""
 
 Metric = Callable[[Tensor, Tensor], float]
@@ -31,7 +41,7 @@ Metric = Callable[[Tensor, Tensor], float]
 
 def less_is_better(metric: str) -> bool:
     """Return whether the metric is a distance."""
-    return metric.startswith("lpips_")
+    return metric.startswith("lpips_") or metric in FLICKER
 
 
 def load_metrics(

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from gsdmsr_cli.evaluation.catalogue import METRICS, less_is_better
+from gsdmsr_cli.evaluation.catalogue import METRICS, OF_TRUTH, less_is_better
 from gsdmsr_cli.evaluation.gates import differences
 from gsdmsr_cli.evaluation.summary import Document, machine, value_of
 
@@ -84,7 +84,8 @@ def _figures(
     best = (min if less_is_better(metric) else max)(rivals, default=None)
     texts = []
     for value, one in zip(values, compared, strict=True):
-        star = " *" if len(rivals) > 1 and value == best and not one.differs else ""
+        judged = len(rivals) > 1 and metric not in OF_TRUTH
+        star = " *" if judged and value == best and not one.differs else ""
         texts.append("none" if value is None else f"{value:.4f}{star}")
     return texts
 

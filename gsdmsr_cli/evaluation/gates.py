@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from gsdmsr_cli.evaluation.catalogue import METRICS, less_is_better
+from gsdmsr_cli.evaluation.catalogue import METRICS, OF_TRUTH, less_is_better
 from gsdmsr_cli.evaluation.request import Demands
 from gsdmsr_cli.evaluation.summary import SCHEMA, value_of
 from gsdmsr_cli.ground.errors import DataError, UsageError, nearest
@@ -91,7 +91,8 @@ class Baseline:
     def judge(self, aggregate: Mapping[str, Any]) -> list[Verdict]:
         """Return a verdict on every metric that is compared."""
         earlier = self.document["aggregate"]
-        numbered = (metric for metric in METRICS if value_of(earlier, metric) is not None)
+        compared = (metric for metric in METRICS if metric not in OF_TRUTH)
+        numbered = (metric for metric in compared if value_of(earlier, metric) is not None)
         tolerances = self.tolerances or dict.fromkeys(numbered, 0.0)
         return [self._judge(metric, t, aggregate) for metric, t in tolerances.items()]
 
@@ -167,6 +168,11 @@ def _number(option: str, text: str) -> tuple[str, float]:
     metric, equals, value = text.partition("=")
     if equals and metric not in METRICS:
         raise UsageError(f"{option} {text}: no such metric; {nearest(metric, METRICS)}")
+    if metric in OF_TRUTH:
+        raise UsageError(
+            f"{option} {text}: {metric} is of the true pictures, which no run changes; use flicker "
+            "or flicker_excess"
+        )
     try:
         number = float(value)
     except ValueError:

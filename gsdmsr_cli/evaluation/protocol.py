@@ -26,6 +26,8 @@ CONVENTIONS = {
     "ms_ssim": "five scales with that window, only the last padded (mirrored), as in torchmetrics",
     "lpips": "v0.1, pictures mapped to [-1, 1]; those named _inria on [0, 1]",
     "parts": "psnr and ssim of the pixels that masks choose, over frames that have such pixels",
+    "flicker": "mean difference of a picture, unrounded, in [0, 1], from the next one warped by "
+    "the true pictures' optical flow, over pixels whose flow there and back agrees",
     "aggregate": "mean over frames",
 }
 """What the numbers mean, as written into every report."""

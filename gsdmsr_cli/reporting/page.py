@@ -117,6 +117,9 @@ def _tiles(document: Document) -> str:
             text = figure(document, f"aggregate.{name}.value")
             tiles.append((f"LPIPS, {kind}", text, "less is better"))
             break
+    if value_of(document["aggregate"], "flicker") is not None:
+        truth = f"the truth {figure(document, 'aggregate.flicker_true.value')}; less is better"
+        tiles.append(("Flicker", figure(document, "aggregate.flicker.value"), truth))
     raster = f"{figure(document, 'speed.fps_raster', '.0f')} without motion"
     training = document["training"]
     tiles += [

@@ -282,7 +282,8 @@ def test_parts_that_masks_choose_are_scored_where_they_are(
         return replace(scene, views=tuple(views))
 
     plain = evaluate()
-    assert plain["parts"] == {}
+    assert plain["parts"] == {} and plain["consecutive"] == {"pairs": 0, "pixels": 0}
+    assert "0 of 3 views have a neighbour" in plain["aggregate"]["flicker"]["reason"]
     monkeypatch.setattr(_trained, "read_scene", read)
     monkeypatch.setattr(seen_pictures, "check", lambda *_: None)  # the masks are new
     document = evaluate("--fail-under", "psnr_moving=1")

@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from gsdmsr_cli.evaluation.catalogue import FLICKER
 from gsdmsr_cli.evaluation.gates import SAME, Threshold, read_gates
 from gsdmsr_cli.evaluation.request import Demands
 from gsdmsr_cli.ground.errors import DataError, UsageError
@@ -189,3 +190,18 @@ def test_a_baseline_that_is_no_report_is_bad_data(content: str, tmp_path: Path) 
     with pytest.raises(DataError, match=r"a\.json: ") as caught:
         read_gates(Demands(baseline=tmp_path / "a.json"))
     assert "\n" not in str(caught.value)
+
+
+def test_flicker_of_the_true_pictures_is_no_demand(tmp_path: Path) -> None:
+    """Nor is a run worse than a baseline by it; by its own flicker it is."""
+    with pytest.raises(UsageError, match="flicker_true is of the true pictures, which no run"):
+        read_gates(Demands(fail_over=("flicker_true=0.1",)))
+    with pytest.raises(UsageError, match="less flicker is better; use --fail-over"):
+        read_gates(Demands(fail_under=("flicker=0.1",)))
+    known = {name: distance(0.01) for name in FLICKER}
+    gates = read_gates(Demands(baseline=written(tmp_path / "a.json", report(**known))))
+    more = {name: distance(0.02) for name in FLICKER}
+    verdicts = gates.judge({"aggregate": more})
+    assert [v.name.split()[0] for v in verdicts] == ["flicker", "flicker_excess"]
+    assert not any(verdict.passed for verdict in verdicts)
+    assert all(verdict.passed for verdict in gates.judge({"aggregate": known}))

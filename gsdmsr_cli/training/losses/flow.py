@@ -19,15 +19,13 @@ from gsdmsr_cli.drawing.flow import blend_motion, screen_motion
 from gsdmsr_cli.options.strict import require
 from gsdmsr_cli.raster import Engine
 from gsdmsr_cli.runs.outputs import FLOW
+from gsdmsr_cli.scene.neighbours import LEAST_SHARE, neighbours
+from gsdmsr_cli.scene.pictured_flow import PicturedFlow
 from gsdmsr_cli.scene.scene import MASK, View
 from gsdmsr_cli.training.losses import Seen, Term
-from gsdmsr_cli.training.losses._pictured_flow import PicturedFlow, neighbours
 
 LEAST_COVER = 0.5
 """Pixels count where the splats cover this much or more."""
-
-LEAST_SHARE = 0.1
-"""The term is left out where fewer of the views than this share have a neighbour."""
 
 
 @dataclass(frozen=True)

@@ -1,15 +1,9 @@
-"""How pictures say that things have moved: optical flow between neighbouring views, kept in files.
-
-Views are neighbours where one camera, or one that has hardly moved, took them one moment after the
-other. Cameras that jump between moments, as in D-NeRF's scenes, have none.
-"""
+"""How pictures say that things have moved: optical flow between two views, kept in files."""
 
 from __future__ import annotations
 
 import contextlib
-import math
 import zlib
-from collections.abc import Sequence
 from hashlib import blake2b
 from pathlib import Path
 from zipfile import BadZipFile
@@ -19,17 +13,10 @@ from torch import Tensor
 
 from gsdmsr_cli.ground.errors import DataError
 from gsdmsr_cli.ground.files import replacing
-from gsdmsr_cli.scene.camera import Camera
 from gsdmsr_cli.scene.native import cv2, one_opencv_thread
 from gsdmsr_cli.scene.optical_flow import Floats32, Grey, optical_flow, trusted
 from gsdmsr_cli.scene.pictures import HalvedPictures, Pictures
 from gsdmsr_cli.scene.scene import View
-
-MOST_TURN = math.radians(5)
-"""Neighbouring views look in directions that differ by this at most [rad]."""
-
-MOST_WAY = 0.1
-"""And are taken from places this far apart at most, in units of how far any are from their mean."""
 
 INCONSISTENT = 1.0
 """Flow there and back that ends so far from its start is not to be trusted [px]."""
@@ -39,42 +26,6 @@ STEPS = 16
 
 SMALLEST = 32
 """Shortest side of pictures that have a flow [px]."""
-
-
-def neighbours(views: Sequence[View]) -> dict[View, tuple[View, ...]]:
-    """Return the views one moment before and after each, from the same place; perhaps neither."""
-    moments: dict[float, list[View]] = {}
-    for view in views:
-        moments.setdefault(view.time, []).append(view)
-    times = sorted(moments)
-    centres = np.stack([view.camera.centre for view in views])
-    most = MOST_WAY * float(np.linalg.norm(centres - centres.mean(0), axis=1).max())
-    found = {}
-    for i, time in enumerate(times):
-        beside = [moments[other] for other in (*times[max(i - 1, 0) : i], *times[i + 1 : i + 2])]
-        for view in moments[time]:
-            nearest = (_nearest(view, others, most) for others in beside)
-            found[view] = tuple(other for other in nearest if other is not None)
-    return found
-
-
-def _nearest(view: View, others: Sequence[View], most: float) -> View | None:
-    """Return the view taken from nearest by, or None if that is too far away."""
-    near = [other for other in others if _alike(view.camera, other.camera, most)]
-    return min(near, key=lambda other: _way(view.camera, other.camera), default=None)
-
-
-def _alike(one: Camera, other: Camera, most: float) -> bool:
-    """Return whether a camera is the other one, or has hardly moved since."""
-    turn = one.rotation @ other.rotation.T
-    cosine = (np.trace(turn) - 1) / 2
-    lens = [(c.fx, c.fy, c.cx, c.cy, c.width, c.height) for c in (one, other)]
-    near = _way(one, other) <= most and cosine >= math.cos(MOST_TURN)
-    return bool(near) and lens[0] == lens[1]
-
-
-def _way(one: Camera, other: Camera) -> float:
-    return float(np.linalg.norm(one.centre - other.centre))
 
 
 class PicturedFlow:
