@@ -27,6 +27,7 @@ from gsdmsr_cli.capture.report import write_page
 from gsdmsr_cli.capture.rig import Rig, read_rig, write_rig
 from gsdmsr_cli.capture.source import Source
 from gsdmsr_cli.capture.stages import Stages
+from gsdmsr_cli.capture.stages import digest as stage_digest
 from gsdmsr_cli.capture.versions import versions
 from gsdmsr_cli.formats import read_scene
 from gsdmsr_cli.ground.errors import DataError
@@ -91,11 +92,13 @@ def prepare(
 def convert(folder: Path, stages: Stages, show_progress: ShowProgress) -> Path:
     """Return the folder of a published data set's scene, one of the stages' folders.
 
+    Frames of its videos that are not beside them are decoded into a stage of their own.
+
     Raises:
         DataError: the data set cannot be used; the message says why.
     """
     with show_progress("reading the data set") as on_progress:
-        scene = read_scene(folder, on_progress)
+        scene = read_scene(folder, on_progress, stages.root / _decoded_name(folder))
 
     def make(made: Path) -> None:
         with show_progress("writing the scene") as on_progress:
@@ -106,6 +109,16 @@ def convert(folder: Path, stages: Stages, show_progress: ShowProgress) -> Path:
         "pictures": picture_hashes.digest(scene.pictures),
     }  # fmt: skip
     return stages.run("scene", key, make)
+
+
+def _decoded_name(folder: Path) -> str:
+    """Return the name of the stage for frames of a data set's videos, which ``read_scene`` fills.
+
+    It is never finished by itself: what is in it is whole, video by video.
+    """
+    videos = sorted(folder.glob("*.mp4"))
+    key = {"videos": picture_hashes.digest(picture_hashes.sampled(folder, videos))}
+    return f"decoded-{stage_digest(key)}"
 
 
 class _Pipeline:

@@ -19,10 +19,14 @@ def cache(
     weights: Annotated[
         bool, typer.Option("--weights", help="With --clear: the weights of LPIPS as well.")
     ] = False,
+    frames: Annotated[
+        bool, typer.Option("--frames", help="With --clear: decoded frames of videos as well.")
+    ] = False,
 ) -> None:
     """Say what is kept to save time later, or remove it."""
-    if weights and not clear:
-        raise UsageError("--weights says what --clear removes; give both or neither")
+    for option, given in (("--weights", weights), ("--frames", frames)):
+        if given and not clear:
+            raise UsageError(f"{option} says what --clear removes; give both or neither")
     from gsdmsr_cli.commands import cache as command
 
-    command.run(clear, weights)
+    command.run(clear, weights, frames)

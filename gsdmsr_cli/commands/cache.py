@@ -14,14 +14,15 @@ from rich.table import Table
 
 from gsdmsr_cli.backends.cpu import jit
 from gsdmsr_cli.evaluation.lpips import weights_in_hub
+from gsdmsr_cli.formats import kept_frames
 from gsdmsr_cli.ground import say
 from gsdmsr_cli.ground.errors import DataError
 from gsdmsr_cli.ground.machine import cache_home
 
 _NAME = re.compile(r"[0-9a-f]{16}")
-"""What folders of kernels are called: a hash of their sources."""
+"""What folders of kernels and frames are called: a hash of their sources."""
 
-KERNELS, GPU_KERNELS, WEIGHTS = "kernels", "GPU kernels", "LPIPS weights"
+KERNELS, GPU_KERNELS, FRAMES, WEIGHTS = "kernels", "GPU kernels", "frames", "LPIPS weights"
 
 
 @dataclass(frozen=True)
@@ -39,18 +40,20 @@ class Kept:
     size: int
 
 
-def run(clear: bool = False, weights: bool = False) -> None:
+def run(clear: bool = False, weights: bool = False, frames: bool = False) -> None:
     """Print what is kept, or what was removed of it.
 
     Args:
         clear: remove kernels; those of a command that is running are compiled again by the next.
         weights: remove the weights of LPIPS as well.
+        frames: remove the frames of videos as well; the next command that needs them decodes them.
 
     Raises:
         DataError: something cannot be removed.
     """
     kept = list(find_kept())
-    gone = [entry for entry in kept if clear and (weights or entry.kind != WEIGHTS)]
+    spared = {kind for kind, asked in ((WEIGHTS, weights), (FRAMES, frames)) if not asked}
+    gone = [entry for entry in kept if clear and entry.kind not in spared]
     for entry in gone:
         _remove(entry.path)
     total = sum(entry.size for entry in (gone if clear else kept))
@@ -63,9 +66,12 @@ def run(clear: bool = False, weights: bool = False) -> None:
 
 
 def find_kept() -> Iterator[Kept]:
-    """Yield what is there: kernels of this version and of others, and weights in torch's folder."""
+    """Yield what is there: kernels of all versions, frames, and weights in torch's folder."""
     home = cache_home()
-    places = (KERNELS, jit.HERE / "__pycache__"), (KERNELS, home), (GPU_KERNELS, home / "cuda")
+    places = (
+        (KERNELS, jit.HERE / "__pycache__"), (KERNELS, home), (GPU_KERNELS, home / "cuda"),
+        (FRAMES, kept_frames()),
+    )  # fmt: skip
     for kind, place in places:
         for path in sorted(place.iterdir()) if place.is_dir() else ():
             if _NAME.fullmatch(path.name) and path.is_dir() and not path.is_symlink():

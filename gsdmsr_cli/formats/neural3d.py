@@ -2,15 +2,12 @@
 
 Facts: Li et al. 2022 and LLFF's ``poses_bounds.npy``; the first camera is for testing, and
 pictures are measured at half their size. Frames are decoded once, to where 4D-GS's scripts put them
-as well.
+as well, or to a folder of the user's.
 """
 
 from __future__ import annotations
 
 import re
-import shutil
-import uuid
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -19,13 +16,12 @@ from numpy.typing import NDArray
 from gsdmsr_cli.formats import _checks as checks
 from gsdmsr_cli.formats import _world
 from gsdmsr_cli.formats._arrays import read_npy
+from gsdmsr_cli.formats._decoded import decode_videos, frames_of, place_of_frames
 from gsdmsr_cli.ground.errors import DataError
-from gsdmsr_cli.ground.locks import in_turn
 from gsdmsr_cli.ground.progress import OnProgress
 from gsdmsr_cli.scene.camera import Camera
-from gsdmsr_cli.scene.imaging import image_size, resize_area, write_png
+from gsdmsr_cli.scene.imaging import image_size
 from gsdmsr_cli.scene.scene import Scene, View
-from gsdmsr_cli.scene.video import read_video, video_length
 
 SIGN = "poses_bounds.npy and cam00.mp4 or cam00/images"
 
@@ -35,49 +31,39 @@ HALVED_FROM = 2000
 FRAME_RATE = 30.0
 """Of all videos of the data set [1 / s]."""
 
-_ELSEWHERE = (
-    "frames are decoded there, once; copy the data to a folder that can be written, or change the "
-    "rights"
-)
-"""What to do where the frames of videos cannot be written."""
-
-_PART = ".part"
-_STALE = re.compile(rf"\.images\.[0-9a-f]{{32}}{re.escape(_PART)}")
-"""What a killed process leaves of a video that it was decoding."""
-
 
 def matches(folder: Path) -> bool:
     """Return whether ``folder`` holds the poses of a rig and its videos or their frames."""
     return (folder / "poses_bounds.npy").is_file() and bool(_cameras(folder))
 
 
+def place_of(folder: Path) -> Path:
+    """Return where frames that are not in ``folder`` are, or are to be decoded.
+
+    Raises:
+        DataError: a video cannot be read.
+    """
+    return place_of_frames(folder, _videos(folder))
+
+
 def is_prepared(folder: Path) -> bool:
     """Return whether the frames of all videos are there."""
-    return all(_frames_of(folder, name).is_dir() for name in _cameras(folder))
+    videos = _videos(folder)
+    place = place_of_frames(folder, videos)
+    return all(frames_of(place, video.stem).is_dir() for video in videos)
 
 
-def prepare(folder: Path, on_progress: OnProgress) -> None:
+def prepare(folder: Path, place: Path, on_progress: OnProgress) -> None:
     """Decode the videos whose frames are not there yet, each to all of its frames or none.
 
     Raises:
         DataError: a video cannot be decoded, or a frame not be written.
     """
-    videos = [
-        folder / f"{name}.mp4" for name in _cameras(folder) if not _frames_of(folder, name).is_dir()
-    ]
-    done, total = 0, sum(map(video_length, videos))
-
-    def count() -> None:
-        nonlocal done
-        done += 1
-        on_progress(done, max(done, total))
-
-    for video in videos:
-        _decode(video, _frames_of(folder, video.stem), count)
+    decode_videos(folder, _videos(folder), place, HALVED_FROM, on_progress)
 
 
-def read(folder: Path) -> Scene:
-    """Read a capture whose videos have been decoded by ``prepare``.
+def read(folder: Path, place: Path) -> Scene:
+    """Read a capture whose videos have been decoded by ``prepare``, to ``place``.
 
     Raises:
         DataError: something in it cannot be used; the message names the file.
@@ -85,13 +71,12 @@ def read(folder: Path) -> Scene:
     names = _cameras(folder)
     path = folder / "poses_bounds.npy"
     rows = _rows(path, len(names))
-    pictures = [sorted(_frames_of(folder, name).glob("*.png")) for name in names]
+    folders = [_own_or_decoded(folder, place, name) for name in names]
+    pictures = [sorted(own.glob("*.png")) for own in folders]
     longest = max(map(len, pictures))
-    for name, found in zip(names, pictures, strict=True):
+    for own, found in zip(folders, pictures, strict=True):
         if not found:
-            raise DataError(
-                f"{_frames_of(folder, name)}: no PNG pictures; remove it to decode again"
-            )
+            raise DataError(f"{own}: no PNG pictures; remove it to decode again")
     views = [
         View(
             name=f"{name}_{picture.stem}",
@@ -117,6 +102,7 @@ def read(folder: Path) -> Scene:
         duration=longest / FRAME_RATE,
         bound=world.bound,
         fingerprint=checks.fingerprint([path]),
+        decoded=place,
     )
 
 
@@ -127,41 +113,16 @@ def _cameras(folder: Path) -> list[str]:
     return sorted(name for name in videos | decoded if re.fullmatch(r"cam\d+", name))
 
 
-def _frames_of(folder: Path, camera: str) -> Path:
-    return folder / camera / "images"
+def _videos(folder: Path) -> list[Path]:
+    """Return the videos of the cameras that have no frames in ``folder``."""
+    names = _cameras(folder)
+    return [folder / f"{n}.mp4" for n in names if not frames_of(folder, n).is_dir()]
 
 
-def _decode(video: Path, target: Path, count: Callable[[], None]) -> None:
-    """Write the frames of a video as PNG files below ``target``, which appears whole.
-
-    Of several processes one decodes, and the others wait for what it has decoded.
-    """
-    with in_turn(target.parent, _ELSEWHERE):
-        if target.is_dir():
-            return
-        beside = target.with_name(f".{target.name}.{uuid.uuid4().hex}{_PART}")
-        try:
-            for stale in target.parent.iterdir():
-                if _STALE.fullmatch(stale.name):
-                    shutil.rmtree(stale, ignore_errors=True)
-            beside.mkdir()
-            for i, (_, picture) in enumerate(read_video(video)):
-                write_png(beside / f"{i:04d}.png", _halved(picture))
-                count()
-            beside.replace(target)
-        except OSError as error:
-            reason = error.strerror or error
-            raise DataError(f"{target}: cannot be written: {reason}; is the disk full?") from error
-        finally:
-            shutil.rmtree(beside, ignore_errors=True)
-
-
-def _halved(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    height, width, _ = picture.shape
-    if width < HALVED_FROM:
-        return picture
-    small = resize_area(picture.astype(np.float32), width // 2, height // 2)
-    return np.rint(small).astype(np.uint8)
+def _own_or_decoded(folder: Path, place: Path, camera: str) -> Path:
+    """Return the folder of a camera's frames: that of the data set, if it is there."""
+    own = frames_of(folder, camera)
+    return own if own.is_dir() else frames_of(place, camera)
 
 
 def _rows(path: Path, cameras: int) -> NDArray[np.float64]:

@@ -27,7 +27,7 @@ def remember(root: Path, scene: Scene, whole: bool) -> None:
     """
     hashes: dict[str, Any] = {SAMPLED: scene.pictures}
     if whole:
-        hashes[WHOLE] = picture_hashes.whole(scene.root, scene.files)
+        hashes[WHOLE] = picture_hashes.whole(scene.root, scene.files, scene.decoded)
     write_json(root / PICTURES, {"gsdmsr": __version__, **hashes})
 
 
@@ -49,7 +49,7 @@ def check_whole(root: Path, scene: Scene) -> None:
             f"{root}: knows no hashes of whole pictures, since it was begun without --verify-data; "
             "drop it here"
         )
-    found = picture_hashes.whole(scene.root, scene.files)
+    found = picture_hashes.whole(scene.root, scene.files, scene.decoded)
     if found != remembered:
         _refuse(root, scene, picture_hashes.difference(found, remembered))
 

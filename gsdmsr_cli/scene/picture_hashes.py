@@ -27,17 +27,22 @@ Hashes = Mapping[str, str]
 """By the name of a file, relative to the scene's folder: 16 hexadecimal digits of a SHA-256."""
 
 
-def sampled(root: Path, paths: Iterable[Path]) -> Hashes:
+def sampled(root: Path, paths: Iterable[Path], decoded: Path | None = None) -> Hashes:
     """Return the hashes of samples of the files.
+
+    Args:
+        root: the scene's folder.
+        paths: of the files.
+        decoded: a folder that stands for the scene's, for the files in it.
 
     Raises:
         DataError: one cannot be read.
     """
-    return {_name(root, path): _hash(path, _sample) for path in paths}
+    return {_name(root, decoded, path): _hash(path, _sample) for path in paths}
 
 
-def whole(root: Path, paths: Iterable[Path]) -> Hashes:
-    """Return the hashes of the whole files.
+def whole(root: Path, paths: Iterable[Path], decoded: Path | None = None) -> Hashes:
+    """Return the hashes of the whole files; see ``sampled``.
 
     Raises:
         DataError: one cannot be read.
@@ -45,7 +50,7 @@ def whole(root: Path, paths: Iterable[Path]) -> Hashes:
     files = list(paths)
     with ThreadPoolExecutor(cores()) as pool:
         found = pool.map(partial(_hash, read=_all), files)
-        return dict(zip((_name(root, path) for path in files), found, strict=True))
+        return dict(zip((_name(root, decoded, path) for path in files), found, strict=True))
 
 
 def digest(hashes: Hashes) -> str:
@@ -64,8 +69,9 @@ def difference(found: Hashes, expected: Hashes) -> str | None:
     return f"{odd[0]} is {'new' if odd[0] in found else 'not there any more'}" if odd else None
 
 
-def _name(root: Path, path: Path) -> str:
-    return Path(os.path.relpath(path, root)).as_posix()
+def _name(root: Path, decoded: Path | None, path: Path) -> str:
+    above = decoded if decoded is not None and path.is_relative_to(decoded) else root
+    return Path(os.path.relpath(path, above)).as_posix()
 
 
 def _hash(path: Path, read: Callable[[Path], Iterable[bytes]]) -> str:

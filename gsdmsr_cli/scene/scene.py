@@ -64,6 +64,8 @@ class Scene:
             the files of the views.
         origin: what ``gsdmsr prepare`` made it from, such as the name of another layout; None where
             it is as it was published.
+        decoded: where files of views lie that are not in ``root``, under the names that they would
+            have there; None if they are all in it.
     """
 
     root: Path
@@ -75,6 +77,7 @@ class Scene:
     bound: float
     fingerprint: str
     origin: str | None = None
+    decoded: Path | None = None
 
     @property
     def files(self) -> list[Path]:
@@ -89,7 +92,7 @@ class Scene:
         Raises:
             DataError: one cannot be read.
         """
-        return picture_hashes.sampled(self.root, self.files)
+        return picture_hashes.sampled(self.root, self.files, self.decoded)
 
     def split(self, name: str) -> tuple[View, ...]:
         """Return the views of one split.

@@ -6,7 +6,9 @@ import json
 from pathlib import Path
 
 import numpy as np
+import pytest
 from datasets import noise, pose, write_dnerf, write_json, write_picture
+from neural3d_videos import CAMERAS, FRAMES, write_n3v
 from test_prepare import prepare
 
 from gsdmsr_cli.formats import read_scene
@@ -48,6 +50,24 @@ def test_pictures_through_a_lens_are_undistorted(tmp_path: Path) -> None:
         undistorted = read_image(new.image_path)
         assert undistorted.shape == (48, 64, 3)
     assert after.bound == before.bound
+
+
+@pytest.mark.parametrize("keep", [(), ("--keep-stages",)])
+def test_videos_of_a_data_set_are_decoded_below_out_and_nowhere_else(
+    tmp_path: Path, keep: tuple[str, ...]
+) -> None:
+    data = write_n3v(tmp_path / "n3v")
+    given = set(data.rglob("*"))
+    ended = prepare(data, "--out", tmp_path / "scene", *keep)
+    assert ended.returncode == 0, ended.stderr
+    assert set(data.rglob("*")) == given
+    stages = tmp_path / "scene.stages"
+    assert stages.is_dir() == bool(keep) == bool(list(stages.glob("decoded-*/cam02/images")))
+    before, after = read_scene(data), read_scene(tmp_path / "scene")
+    assert len(after.views) == len(before.views) == CAMERAS * FRAMES
+    for old, new in zip(before.views, after.views, strict=True):
+        assert (new.split, new.time) == (old.split, old.time)
+        assert new.image_path.read_bytes() == old.image_path.read_bytes()
 
 
 def test_masks_for_known_cameras_are_refused(tmp_path: Path) -> None:

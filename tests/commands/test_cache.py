@@ -29,6 +29,7 @@ def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         tmp_path / "cache" / "gsdmsr" / OTHER / "b.nbc": 20,
         tmp_path / "cache" / "gsdmsr" / "notes.txt": 1000,
         tmp_path / "cache" / "gsdmsr" / "cuda" / HASH / "c.cubin": 30,
+        tmp_path / "cache" / "gsdmsr" / "frames" / HASH / "cam00" / "images" / "0000.png": 50,
         tmp_path / "cache" / "others" / HASH / "d": 1000,
         weights / ARCHITECTURES["alex"].checkpoint: 40,
         weights / "somebody-elses.pth": 1000,
@@ -53,7 +54,7 @@ def sizes(entries: list[dict[str, Any]]) -> dict[str, list[int]]:
     return found
 
 
-ALL = {"kernels": [10, 20], "GPU kernels": [30], "LPIPS weights": [40]}
+ALL = {"kernels": [10, 20], "GPU kernels": [30], "frames": [50], "LPIPS weights": [40]}
 
 
 def test_what_is_kept_is_listed_and_stays(home: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -65,17 +66,19 @@ def test_what_is_kept_is_listed_and_stays(home: Path, capsys: pytest.CaptureFixt
     assert "kept: 0.0 MB" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("weights", [False, True])
+@pytest.mark.parametrize(("weights", "frames"), [(False, False), (True, False), (False, True)])
 def test_only_what_is_ours_is_removed(
-    home: Path, weights: bool, capsys: pytest.CaptureFixture[str]
+    home: Path, weights: bool, frames: bool, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    found = answer(capsys, True, weights)
-    kept = {} if weights else {"LPIPS weights": [40]}
+    found = answer(capsys, True, weights, frames)
+    kept = {"frames": [50]} if not frames else {}
+    kept |= {"LPIPS weights": [40]} if not weights else {}
     assert sizes(found["kept"]) == kept
     assert sizes(found["removed"]) == {k: v for k, v in ALL.items() if k not in kept}
     left = {path.name for path in home.rglob("*") if path.is_file()}
     others = {"jit.cpython-311.pyc", "notes.txt", "d", "somebody-elses.pth"}
-    assert left == others | (set() if weights else {ARCHITECTURES["alex"].checkpoint})
+    spared = {"0000.png": frames, ARCHITECTURES["alex"].checkpoint: weights}
+    assert left == others | {name for name, removed in spared.items() if not removed}
     assert answer(capsys)["removed"] == []
 
 

@@ -12,43 +12,17 @@ import numpy as np
 import pytest
 from datasets import noise, write_picture
 from full_disk import full_at_every_change, has_failed
+from neural3d_videos import CAMERAS, FRAMES, WIDTH, encode, row, write_n3v
 from refusals import assert_refused
 
-from gsdmsr_cli.formats import neural3d, read_scene
+from gsdmsr_cli.formats import _decoded, needs_preparing, read_scene
 from gsdmsr_cli.ground.errors import DataError
 from gsdmsr_cli.scene.imaging import read_image
-from gsdmsr_cli.scene.native import cv2
-
-CAMERAS, FRAMES = 3, 5
-WIDTH, HEIGHT = 64, 48
-
-
-def encode(path: Path, frames: int = FRAMES, width: int = WIDTH, height: int = HEIGHT) -> None:
-    """Write frames that get brighter, in the camera's own tint."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), 30.0, (width, height))
-    assert writer.isOpened()
-    for i in range(frames):
-        picture = np.full((height, width, 3), 40 * i + 20, np.uint8)
-        writer.write(picture)
-    writer.release()
-
-
-def row(i: int) -> list[float]:
-    """A camera at (i, 0, 0) that looks along world z, y down, as LLFF writes it."""
-    right, down, back = [1.0, 0, 0], [0, 1.0, 0], [0, 0, -1.0]
-    centre, size = [float(i), 0, 0], [HEIGHT, WIDTH, 60.0]
-    table = np.stack([down, right, back, centre, size], axis=1)  # columns
-    return [*table.ravel().tolist(), 1.0, 16.0]
 
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    folder = tmp_path / "scene"
-    for i in range(CAMERAS):
-        encode(folder / f"cam{i:02d}.mp4")
-    np.save(folder / "poses_bounds.npy", [row(i) for i in range(CAMERAS)])
-    return folder
+    return write_n3v(tmp_path / "scene")
 
 
 def test_a_rig_is_read_and_its_first_camera_is_for_testing(folder: Path) -> None:
@@ -97,7 +71,7 @@ def test_wide_videos_are_halved(folder: Path) -> None:
 def test_an_interrupted_decoding_leaves_nothing_that_looks_finished(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    write, written = neural3d.write_png, []
+    write, written = _decoded.write_png, []
 
     def interrupt(path: Path, picture: np.ndarray) -> None:
         if len(written) == FRAMES + 2:
@@ -105,14 +79,14 @@ def test_an_interrupted_decoding_leaves_nothing_that_looks_finished(
         written.append(path)
         write(path, picture)
 
-    monkeypatch.setattr(neural3d, "write_png", interrupt)
+    monkeypatch.setattr(_decoded, "write_png", interrupt)
     with pytest.raises(KeyboardInterrupt):
         read_scene(folder)
     assert sorted(p.name for p in (folder / "cam00").iterdir()) == ["images"]
     assert not list((folder / "cam01").iterdir())
     stale = folder / "cam01" / f".images.{'12' * 16}.part"  # as a killed process leaves it
     stale.mkdir()
-    monkeypatch.setattr(neural3d, "write_png", write)
+    monkeypatch.setattr(_decoded, "write_png", write)
     assert len(read_scene(folder).views) == CAMERAS * FRAMES
     assert not stale.exists()
 
@@ -135,16 +109,78 @@ def test_a_disk_that_is_full_at_any_change_leaves_nothing_that_looks_finished(
             assert len(read_scene(folder).views) == 4
 
 
-def test_a_folder_that_cannot_be_written_is_refused_with_what_to_do(
-    folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def refuse(path: Path, **_: Any) -> None:
-        raise OSError(30, "Read-only file system", str(path))
+@pytest.fixture
+def read_only(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> set[Path]:
+    """The data set on a drive that cannot be written; returns all that is in it."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setattr(_decoded, "can_be_written", lambda path: folder not in path.parents)
+    mkdir = Path.mkdir
+
+    def refuse(path: Path, *given: Any, **named: Any) -> None:
+        if folder in path.parents:
+            raise OSError(30, "Read-only file system", str(path))
+        mkdir(path, *given, **named)
 
     monkeypatch.setattr(Path, "mkdir", refuse)
-    with pytest.raises(DataError, match=r"cam00: cannot be made: Read-only .*; frames are") as e:
-        read_scene(folder)
-    assert "copy the data to a folder that can be written" in str(e.value)
+    return set(folder.rglob("*"))
+
+
+def test_frames_of_a_folder_that_cannot_be_written_are_kept_in_the_cache(
+    folder: Path, read_only: set[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert needs_preparing(folder)
+    scene = read_scene(folder)
+    assert set(folder.rglob("*")) == read_only
+    told = capsys.readouterr().err
+    assert "scene cannot be written, so its videos are decoded into" in told
+    assert "GSDMSR_FRAMES_DIR would name another folder" in told
+    (kept,) = (tmp_path / "cache" / "gsdmsr" / "frames").iterdir()
+    assert all(view.image_path.is_relative_to(kept) for view in scene.views)
+    stamps = [view.image_path.stat().st_mtime_ns for view in scene.views]
+    again = read_scene(folder)
+    assert [view.image_path.stat().st_mtime_ns for view in again.views] == stamps
+    assert not needs_preparing(folder) and not capsys.readouterr().err
+
+
+def test_frames_go_where_the_user_says(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before = set(folder.rglob("*"))
+    monkeypatch.setenv("GSDMSR_FRAMES_DIR", str(tmp_path / "frames"))
+    apart = read_scene(folder)
+    assert set(folder.rglob("*")) == before and len(list((tmp_path / "frames").iterdir())) == 1
+    encode(folder / "cam01.mp4", frames=FRAMES + 1)  # another video is decoded anew
+    read_scene(folder)
+    assert len(list((tmp_path / "frames").iterdir())) == 2
+    encode(folder / "cam01.mp4")
+    monkeypatch.delenv("GSDMSR_FRAMES_DIR")
+    inside = read_scene(folder)
+    assert all(view.image_path.is_relative_to(folder) for view in inside.views)
+    assert inside.pictures == apart.pictures, "a run knows its data wherever its frames lie"
+    assert "cam01/images/0003.png" in inside.pictures
+
+
+def test_a_camera_whose_frames_are_there_is_not_decoded_again(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    read_scene(folder)
+    (folder / "cam02" / "images").rename(tmp_path / "away")
+    monkeypatch.setenv("GSDMSR_FRAMES_DIR", str(tmp_path / "frames"))
+    views = read_scene(folder).views
+    inside = {view.name[:5] for view in views if view.image_path.is_relative_to(folder)}
+    assert len(views) == CAMERAS * FRAMES and inside == {"cam00", "cam01"}
+
+
+def test_where_no_place_can_be_written_it_is_said_what_to_do(
+    folder: Path, read_only: set[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "file").touch()
+    for variable, place in (("GSDMSR_FRAMES_DIR", "file"), ("XDG_CACHE_HOME", "file/cache")):
+        monkeypatch.setenv(variable, str(tmp_path / place))
+        with pytest.raises(DataError, match=r"cam00: cannot be made: .*; frames of videos") as e:
+            read_scene(folder)
+        assert "name a folder for them in GSDMSR_FRAMES_DIR, or write a scene" in str(e.value)
+        monkeypatch.delenv(variable)
 
 
 def poses(change: Callable[[np.ndarray], Any]) -> Callable[[Path], Any]:
@@ -200,14 +236,14 @@ def test_two_readers_at_once_decode_every_video_once(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """One waits for the other; each then has all frames."""
-    real, decoded = neural3d.read_video, list[str]()
+    real, decoded = _decoded.read_video, list[str]()
 
     def read(path: Path) -> Any:
         decoded.append(path.name)
         time.sleep(0.05)
         return real(path)
 
-    monkeypatch.setattr(neural3d, "read_video", read)
+    monkeypatch.setattr(_decoded, "read_video", read)
     with ThreadPoolExecutor(2) as pool:
         scenes = list(pool.map(read_scene, [folder, folder]))
     assert [len(scene.views) for scene in scenes] == [CAMERAS * FRAMES] * 2
