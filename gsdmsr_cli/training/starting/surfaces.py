@@ -41,6 +41,9 @@ DEPTHS, FINER = 40, 12
 SIDE = 200
 """Pictures are shrunk to about so many pixels along the shorter side."""
 
+KEPT = 64
+"""Shrunk pictures in memory at a time; partners of a view are often those of the next as well."""
+
 PATCH = ((0, 0), (-2, -2), (0, -2), (2, -2), (-2, 0), (2, 0), (-2, 2), (0, 2), (2, 2))
 """Pixels that are compared together, the first of which sends out the ray."""
 
@@ -111,12 +114,16 @@ class _Album:
 
     def picture(self, row: int) -> Tensor:
         """Return a shrunk picture, (3, h, w) in [0, 1]."""
-        if row not in self._loaded:
+        small = self._loaded.pop(row, None)
+        if small is None:
             camera = self.cameras[row]
             pixels = self._pictures.load(self._views[row]).permute(1, 2, 0).numpy().astype("f4")
-            small = imaging.resize_area(pixels, camera.width, camera.height) / 255
-            self._loaded[row] = torch.from_numpy(small).permute(2, 0, 1).contiguous()
-        return self._loaded[row]
+            shrunk = imaging.resize_area(pixels, camera.width, camera.height) / 255
+            small = torch.from_numpy(shrunk).permute(2, 0, 1).contiguous()
+        self._loaded[row] = small  # behind the others, the last of all to go
+        if len(self._loaded) > KEPT:
+            del self._loaded[next(iter(self._loaded))]
+        return small
 
     def counted(self, row: int, pixels: Tensor) -> Tensor:
         """Return which pixels (P, 2) of a shrunk picture count, (P,) bool."""

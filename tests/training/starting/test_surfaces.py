@@ -17,6 +17,7 @@ from gsdmsr_cli.options.preset import SplatOptions
 from gsdmsr_cli.scene.camera import Camera, look_at
 from gsdmsr_cli.scene.pictures import Pictures
 from gsdmsr_cli.scene.scene import Scene, View
+from gsdmsr_cli.training.starting import surfaces
 from gsdmsr_cli.training.starting.initial import initial_splats
 from gsdmsr_cli.training.starting.sightings import colours_of, places
 from gsdmsr_cli.training.starting.surfaces import _Album, sample_points
@@ -172,6 +173,27 @@ def album_of(cameras: list[Camera], times: list[float], mask: Tensor | None = No
     nothing = np.zeros((0, 3), np.float32)
     scene = Scene(Path(), "test", tuple(views), nothing, None, None, 1.0, "")
     return _Album(scene, pictures)
+
+
+def test_how_many_small_pictures_are_kept_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    scene, pictures = capture(12)
+    most = list[int]()
+    whole = _Album.picture
+
+    def watched(album: _Album, row: int) -> Tensor:
+        found = whole(album, row)
+        most.append(len(album._loaded))
+        return found
+
+    monkeypatch.setattr(_Album, "picture", watched)
+    found = []
+    for kept in (1, 4, 1000):
+        monkeypatch.setattr(surfaces, "KEPT", kept)
+        most.clear()
+        found.append(sample_points(scene, pictures, 600, generator(0)))
+        assert max(most) == min(kept, 12)
+    for one in found[:2]:
+        assert all(map(torch.equal, one, found[2]))
 
 
 def test_partners_are_near_but_not_at_one_place_with_each_other() -> None:
