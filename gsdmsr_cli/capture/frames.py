@@ -13,6 +13,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from gsdmsr_cli.capture.candidates import (
+    Candidate,
+    choose,
+    leave_out_blurred,
+    leave_out_plain,
+)
 from gsdmsr_cli.capture.cuts import (
     Thumbnail,
     change,
@@ -26,6 +32,7 @@ from gsdmsr_cli.ground.errors import DataError
 from gsdmsr_cli.ground.files import read_json, write_json
 from gsdmsr_cli.ground.limits import cores
 from gsdmsr_cli.ground.progress import OnProgress
+from gsdmsr_cli.scene.high_range import high_ranges
 from gsdmsr_cli.scene.imaging import read_image, write_png
 from gsdmsr_cli.scene.native import cv2
 from gsdmsr_cli.scene.picture_files import IN_CAPTURES
@@ -35,33 +42,10 @@ Picture = NDArray[np.uint8]
 LEAST = 8
 """Fewer frames do not make a scene."""
 
-BLURRED = 0.2
-"""Frames are left out whose sharpness is below this share of their neighbours' median."""
-
-NEIGHBOURS = 5
-"""So many frames before and after one are its neighbours."""
-
 PICTURES, NOTE = "pictures", "frames.json"
 """Folder and file that ``read_frames`` reads."""
 
 _SHARPNESS_SIDE = 640  # longer side at which sharpness is measured [px]
-
-
-@dataclass(frozen=True)
-class Candidate:
-    """A picture that might become a frame.
-
-    Attributes:
-        file: name of the picture or video.
-        index: number of the frame in its video.
-        time: seconds, or steps where seconds are unknown, from the first.
-        sharpness: variance of the Laplacian, or 0 where it is not known.
-    """
-
-    file: str
-    index: int
-    time: float
-    sharpness: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -80,6 +64,8 @@ class Frames:
         blurred: those that were left out because they are blurred.
         cuts: where the videos have been cut, as a file and seconds in it; only the longest shot
             was looked at.
+        plain: how many pictures were left out before, since they are of one colour.
+        high_range: videos of high dynamic range, with what that is called.
     """
 
     folder: Path
@@ -92,6 +78,8 @@ class Frames:
     focal: float | None
     blurred: tuple[Candidate, ...]
     cuts: tuple[tuple[str, float], ...] = ()
+    plain: int = 0
+    high_range: tuple[tuple[str, str], ...] = ()
 
     @property
     def times(self) -> list[float]:
@@ -115,13 +103,15 @@ def write_frames(
     """
     survey = _survey_videos if source.kind == "video" else _survey_pictures
     candidates, in_seconds, tags, cuts = survey(source, count, on_progress)
-    chosen = choose(candidates, count)
-    taken, blurred = leave_out_blurred(chosen)
+    showing = leave_out_plain(candidates)
+    plain = len(candidates) - len(showing)
+    taken, blurred = leave_out_blurred(choose(showing, count))
     if len(taken) < LEAST:
         shot = f", in the longest of {len(cuts) + 1} shots" if cuts else ""
+        black = f", {plain} of them black or of one colour" if plain else ""
         raise DataError(
-            f"{source.root}: {len(taken)} usable frames of {len(candidates)}{shot}; at least "
-            f"{LEAST} are needed: film for longer, or give more pictures"
+            f"{source.root}: {len(taken)} usable frames of {len(candidates)}{shot}{black}; at "
+            f"least {LEAST} are needed: film for longer, or give more pictures"
         )
     (folder / PICTURES).mkdir()
     names = tuple(f"{i:05d}.png" for i in range(len(taken)))
@@ -145,6 +135,8 @@ def write_frames(
             "frames": [asdict(frame) for frame in taken],
             "blurred": [asdict(frame) for frame in blurred],
             "cuts": cuts,
+            "plain": plain,
+            "high_range": high_ranges(source.files) if source.kind == "video" else [],
             "of_pictures": source.kind == "images",
             "in_seconds": in_seconds,
             "size": size,
@@ -169,34 +161,9 @@ def read_frames(folder: Path) -> Frames:
         focal=note["focal"],
         blurred=tuple(Candidate(**frame) for frame in note["blurred"]),
         cuts=tuple((file, time) for file, time in note.get("cuts", ())),
+        plain=note.get("plain", 0),
+        high_range=tuple((file, kind) for file, kind in note.get("high_range", ())),
     )
-
-
-def choose(candidates: Sequence[Candidate], count: int) -> list[Candidate]:
-    """Return the sharpest candidate of each of ``count`` equal parts of the time; all if fewer."""
-    if len(candidates) <= count:
-        return list(candidates)
-    first, last = candidates[0].time, candidates[-1].time
-    bins: dict[int, Candidate] = {}
-    for candidate in candidates:
-        part = min(int((candidate.time - first) / (last - first) * count), count - 1)
-        if part not in bins or candidate.sharpness > bins[part].sharpness:
-            bins[part] = candidate
-    return list(bins.values())
-
-
-def leave_out_blurred(chosen: Sequence[Candidate]) -> tuple[list[Candidate], list[Candidate]]:
-    """Return the frames that are as sharp as their neighbours, and those that are not nearly so.
-
-    Sharpness depends on what is seen, so only frames close in time are compared.
-    """
-    taken: list[Candidate] = []
-    blurred: list[Candidate] = []
-    for i, frame in enumerate(chosen):
-        near = [other.sharpness for other in chosen[max(i - NEIGHBOURS, 0) : i + NEIGHBOURS + 1]]
-        poor = frame.sharpness < BLURRED * float(np.median(near))
-        (blurred if poor else taken).append(frame)
-    return taken, blurred
 
 
 def sharpness(picture: Picture) -> float:

@@ -9,9 +9,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from gsdmsr_cli.capture.candidates import Candidate
 from gsdmsr_cli.capture.exif import read_exif, upright
 from gsdmsr_cli.capture.features import Features
-from gsdmsr_cli.capture.frames import Candidate, Frames
+from gsdmsr_cli.capture.frames import Frames
 from gsdmsr_cli.capture.source import PICTURES, Source
 from gsdmsr_cli.ground.errors import DataError
 from gsdmsr_cli.ground.files import write_json
@@ -25,6 +26,9 @@ Mask = NDArray[np.bool_]
 MARGIN = 0.008
 """Masks grow by this share of the longer side before features are left out: those at an edge see
 both sides of it."""
+
+COVERED = 0.98
+"""From what is left of a frame beyond this share no camera is found."""
 
 NOTE = "masks.json"
 
@@ -130,6 +134,22 @@ def write_mask(path: Path, moving: Mask) -> None:
 def read_mask(path: Path) -> Mask:
     """Return the (H, W) mask that ``write_mask`` has written."""
     return np.asarray(read_image(path)[..., 0] >= 128, dtype=np.bool_)
+
+
+def require_room(folder: Path, frames: Frames, remedy: str) -> None:
+    """Raise DataError if masks leave hardly anything of most frames to find cameras from.
+
+    Args:
+        folder: of the frames' masks.
+        frames: that they are of.
+        remedy: what to do about it.
+    """
+    covered = [bool(read_mask(folder / name).mean() > COVERED) for name in frames.names]
+    if 2 * sum(covered) > len(covered):
+        raise DataError(
+            f"masks cover more than {100 * COVERED:.0f} % of {sum(covered)} of {len(covered)} "
+            f"frames, so nothing is left to find cameras from: {remedy}"
+        )
 
 
 def standing(features: Features, moving: Mask) -> Features:

@@ -16,7 +16,7 @@ from gsdmsr_cli.capture.consistency import moving_share, turning_share
 from gsdmsr_cli.capture.convert import write_converted
 from gsdmsr_cli.capture.features import write_features
 from gsdmsr_cli.capture.frames import Frames, read_frames, write_frames
-from gsdmsr_cli.capture.masks import digest, write_given_masks
+from gsdmsr_cli.capture.masks import digest, require_room, write_given_masks
 from gsdmsr_cli.capture.motion import write_found_masks
 from gsdmsr_cli.capture.normalize import normalize
 from gsdmsr_cli.capture.options import Options
@@ -66,9 +66,14 @@ def prepare(
     moving, masked_by = None, "nothing"
     if masks is not None:
         moving, masked_by = pipeline.take_masks(masks, frames), "given"
+        turned = "drop --invert-masks" if masks.inverted else "--invert-masks takes black for it"
+        require_room(moving, frames, f"is it white that moves? {turned}")
     elif options.auto_mask:
         _, first = pipeline.find_cameras(frames, features, None)
         moving, masked_by = pipeline.find_masks(frames, first), "found"
+        require_room(
+            moving, frames, "the first cameras are wrong: drop --auto-mask or give --masks"
+        )
     matches, found = pipeline.find_cameras(frames, features, moving)
     require_registered(frames, found, options.min_registered)
     with show_progress("judging the cameras"):

@@ -68,6 +68,8 @@ def assess(
             "dropped": _dropped(frames, found),
             "parts": [len(part) for part in found.parts],
             "left_out_as_blurred": len(frames.blurred),
+            "left_out_as_plain": frames.plain,
+            "high_range": [{"file": file, "kind": kind} for file, kind in frames.high_range],
             "cuts": [{"file": file, "seconds": seconds} for file, seconds in frames.cuts],
         },
         "reprojection_px": found.mean_error,
@@ -168,6 +170,15 @@ def warnings(report: Mapping[str, Any]) -> list[str]:
         found.append(
             f"the video has been cut ({told}{more}) and only its longest shot is taken: to take "
             "another, give that part as a video of its own"
+        )
+    if frames["left_out_as_plain"]:
+        found.append(
+            f"{frames['left_out_as_plain']} pictures are black or of one colour and are left out"
+        )
+    for video in frames["high_range"]:
+        found.append(
+            f"{video['file']} is HDR ({video['kind']}): its colours are taken as they are stored, "
+            "so pictures look flat and pale; convert it to SDR first"
         )
     if frames["left_out_as_blurred"]:
         found.append(

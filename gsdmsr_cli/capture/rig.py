@@ -13,12 +13,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from gsdmsr_cli.capture.candidates import Candidate
 from gsdmsr_cli.capture.features import find_features
-from gsdmsr_cli.capture.frames import NOTE, PICTURES, Candidate, shrunk
+from gsdmsr_cli.capture.frames import NOTE, PICTURES, shrunk
 from gsdmsr_cli.capture.source import Source
 from gsdmsr_cli.ground.errors import DataError, UsageError, nearest
 from gsdmsr_cli.ground.files import read_json, write_json
 from gsdmsr_cli.ground.progress import OnProgress
+from gsdmsr_cli.scene.high_range import high_ranges
 from gsdmsr_cli.scene.imaging import read_image, write_png
 from gsdmsr_cli.scene.native import cv2
 from gsdmsr_cli.scene.scene import View
@@ -146,7 +148,8 @@ def write_rig(
     write_json(
         folder / NOTE,
         {
-            "frames": taken, "blurred": [], "cuts": [], "of_pictures": True, "in_seconds": False,
+            "frames": taken, "blurred": [], "cuts": [], "plain": 0,
+            "high_range": high_ranges(source.files), "of_pictures": True, "in_seconds": False,
             "size": sizes[0], "original_size": sizes[0], "focal": None,
         },
     )  # fmt: skip

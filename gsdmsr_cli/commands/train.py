@@ -33,6 +33,7 @@ from gsdmsr_cli.scene.scene import Scene
 from gsdmsr_cli.training import memory
 from gsdmsr_cli.training.gradients.workers import processes_for
 from gsdmsr_cli.training.loop import Report, train
+from gsdmsr_cli.training.masks import check_masks
 from gsdmsr_cli.training.request import Request
 from gsdmsr_cli.training.trainer import Trainer
 from gsdmsr_cli.training.warm_up import warm_up, warm_up_motion
@@ -133,6 +134,9 @@ def _prepare(scene: Scene, options: Preset, device: str) -> Trainer:
         BACKGROUNDS[options.data.background], options.data.downscale, options.data.cache_mib << 20
     )
     _preload(pictures, scene)
+    doubt = check_masks(pictures, scene.split("train"))
+    if doubt is not None:
+        say.warn(doubt)
     return Trainer(scene, options, raster.best_engine(device), pictures, device)
 
 

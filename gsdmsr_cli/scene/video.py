@@ -29,12 +29,13 @@ LONGEST_GAP = 60.0
 _FORMATS = "mov,matroska,webm,avi,mpegts,mpeg,mpegvideo,flv,ogg,asf,gif"
 """Containers, as FFmpeg names them. Others, such as lists of files, would open further files."""
 
-_ALLOWED = {"protocol_whitelist": "file", "format_whitelist": _FORMATS}
+ALLOWED = {"protocol_whitelist": "file", "format_whitelist": _FORMATS}
+"""What FFmpeg is allowed when it opens a video."""
 
 # read by OpenCV before it opens a video: what FFmpeg prints says nothing to a user
 os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
 os.environ.setdefault(
-    "OPENCV_FFMPEG_CAPTURE_OPTIONS", "|".join(f"{key};{value}" for key, value in _ALLOWED.items())
+    "OPENCV_FFMPEG_CAPTURE_OPTIONS", "|".join(f"{key};{value}" for key, value in ALLOWED.items())
 )
 cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_ERROR)
 
@@ -143,7 +144,7 @@ def _require_bearable(path: Path) -> None:
     try:
         size = path.stat().st_size
         most = min(PIXELS_PER_BYTE * size, MOST_PIXELS)
-        with av.open(str(path), options=_ALLOWED | {"max_pixels": str(most)}) as file:
+        with av.open(str(path), options=ALLOWED | {"max_pixels": str(most)}) as file:
             contexts = [stream.codec_context for stream in file.streams.video[:1]]
             sizes = [(c.width, c.height) for c in contexts if c is not None]  # of known codecs
     except (av.FFmpegError, OSError, ValueError, MemoryError):
@@ -170,7 +171,7 @@ def _sizes(path: Path, _modified: int, _length: int) -> list[tuple[int, int]]:
     av = load_av()
     sizes: dict[tuple[int, int], None] = {}
     try:
-        with av.open(str(path), options=_ALLOWED) as file:
+        with av.open(str(path), options=ALLOWED) as file:
             file.streams.video[0].codec_context.skip_frame = "NONKEY"
             for frame in file.decode(video=0):
                 sizes[frame.width, frame.height] = None

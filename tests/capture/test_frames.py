@@ -10,15 +10,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from gsdmsr_cli.capture.candidates import Candidate, choose, leave_out_blurred
 from gsdmsr_cli.capture.exif import FULL_FRAME_DIAGONAL, read_exif, upright
-from gsdmsr_cli.capture.frames import (
-    Candidate,
-    choose,
-    leave_out_blurred,
-    read_frames,
-    sharpness,
-    write_frames,
-)
+from gsdmsr_cli.capture.frames import read_frames, sharpness, write_frames
 from gsdmsr_cli.capture.source import Source, find_source
 from gsdmsr_cli.ground.errors import DataError
 from gsdmsr_cli.scene.native import OpenImageIO

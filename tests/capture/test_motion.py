@@ -10,7 +10,8 @@ import pytest
 import room
 
 from gsdmsr_cli.capture import motion
-from gsdmsr_cli.capture.frames import Candidate, Frames
+from gsdmsr_cli.capture.candidates import Candidate
+from gsdmsr_cli.capture.frames import Frames
 from gsdmsr_cli.capture.masks import NOTE, read_mask
 from gsdmsr_cli.capture.reconstruction import Reconstruction
 from gsdmsr_cli.scene.imaging import write_png

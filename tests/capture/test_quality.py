@@ -13,7 +13,8 @@ import numpy as np
 import pytest
 from datasets import write_picture
 
-from gsdmsr_cli.capture.frames import Candidate, Frames
+from gsdmsr_cli.capture.candidates import Candidate
+from gsdmsr_cli.capture.frames import Frames
 from gsdmsr_cli.capture.masks import NOTE
 from gsdmsr_cli.capture.quality import assess, parallaxes, warnings
 from gsdmsr_cli.capture.reconstruction import Reconstruction
@@ -42,8 +43,9 @@ def frames(of_pictures: bool = False) -> Frames:
     names = tuple(f"{i:03d}.png" for i in range(4))
     size = WIDTH, HEIGHT
     return Frames(
-        Path(), names, taken, of_pictures, True, size, size, 75.0, ("b",) * 2, (("film0.mp4", 1.5),)
-    )
+        Path(), names, taken, of_pictures, True, size, size, 75.0, ("b",) * 2, CUTS, 3,
+        (("film1.mp4", "PQ"),),
+    )  # fmt: skip
 
 
 CUTS = (("film0.mp4", 1.5),)
@@ -53,7 +55,9 @@ def test_the_report_of_a_walk() -> None:
     report = assess(frames(), reconstruction(), 0.02, 0.3, "nothing", None)
     assert report["frames"] == {
         "chosen": 4, "registered": 3, "dropped": ["film3.mp4 frame 30"], "parts": [3, 2],
-        "left_out_as_blurred": 2, "cuts": [{"file": "film0.mp4", "seconds": 1.5}],
+        "left_out_as_blurred": 2, "left_out_as_plain": 3,
+        "cuts": [{"file": "film0.mp4", "seconds": 1.5}],
+        "high_range": [{"file": "film1.mp4", "kind": "PQ"}],
     }  # fmt: skip
     assert report["reprojection_px"] == pytest.approx((3 * 0.4 + 2 * 0.8 + 0.5 + 0.1) / 7)
     assert report["track_length"] == 7 / 4 and report["points"] == 4
@@ -126,6 +130,8 @@ SOUND: dict[str, Any] = {
         "registered": 95,
         "dropped": ["x"] * 5,
         "left_out_as_blurred": 0,
+        "left_out_as_plain": 0,
+        "high_range": [],
         "cuts": [],
     },
     "reprojection_px": 1.0,
@@ -144,6 +150,8 @@ SOUND: dict[str, Any] = {
 DOUBTFUL = {
     "frames without a camera": ("frames.registered", 94, "5 of 100 frames have no camera"),
     "blurred": ("frames.left_out_as_blurred", 1, "1 frames are far less sharp"),
+    "black": ("frames.left_out_as_plain", 2, "2 pictures are black or of one colour"),
+    "HDR": ("frames.high_range", [{"file": "a.mp4", "kind": "HLG"}], "a.mp4 is HDR (HLG): its"),
     "cut": ("frames.cuts", [{"file": "a.mp4", "seconds": 3.2}], "cut (a.mp4 at 3.20 s)"),
     "off": ("reprojection_px", 1.01, "1.01 px off where they should be seen, more than 1:"),
     "moving": ("moving_matches", 0.11, "11 % of what was found in two frames moves"),
