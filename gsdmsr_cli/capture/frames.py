@@ -66,6 +66,7 @@ class Frames:
             was looked at.
         plain: how many pictures were left out before, since they are of one colour.
         high_range: videos of high dynamic range, with what that is called.
+        doubts: what else is doubtful, one sentence each.
     """
 
     folder: Path
@@ -80,6 +81,7 @@ class Frames:
     cuts: tuple[tuple[str, float], ...] = ()
     plain: int = 0
     high_range: tuple[tuple[str, str], ...] = ()
+    doubts: tuple[str, ...] = ()
 
     @property
     def times(self) -> list[float]:
@@ -163,6 +165,7 @@ def read_frames(folder: Path) -> Frames:
         cuts=tuple((file, time) for file, time in note.get("cuts", ())),
         plain=note.get("plain", 0),
         high_range=tuple((file, kind) for file, kind in note.get("high_range", ())),
+        doubts=tuple(note.get("doubts", ())),
     )
 
 

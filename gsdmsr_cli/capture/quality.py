@@ -89,7 +89,7 @@ def assess(
         "turning_matches": turning,
         "masks": _mask_report(frames, masked_by, masks),
     }
-    report["warnings"] = warnings(report)
+    report["warnings"] = [*frames.doubts, *warnings(report)]
     return report
 
 

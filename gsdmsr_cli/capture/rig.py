@@ -5,8 +5,8 @@ Cameras are found from one picture of each, the median of a few moments: what mo
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from itertools import count
 from pathlib import Path
 
@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsdmsr_cli.capture.candidates import Candidate
+from gsdmsr_cli.capture.clocks import Floats, common_moments, doubts_about, frames_at
 from gsdmsr_cli.capture.features import find_features
 from gsdmsr_cli.capture.frames import NOTE, PICTURES, shrunk
 from gsdmsr_cli.capture.source import Source
@@ -27,7 +28,6 @@ from gsdmsr_cli.scene.scene import View
 from gsdmsr_cli.scene.video import read_video, video_length
 
 Picture = NDArray[np.uint8]
-Floats = NDArray[np.float64]
 LEAST = 3
 """Fewer cameras do not make a rig."""
 
@@ -49,14 +49,16 @@ class Rig:
         folder: of the pictures of all cameras at all moments.
         cameras: names of the videos, without their suffix.
         times: the moments, seconds from the first.
+        missing: by the number of a camera, the moments at which it has no frame.
     """
 
     folder: Path
     cameras: tuple[str, ...]
     times: tuple[float, ...]
+    missing: Mapping[int, Collection[int]] = field(default_factory=dict)
 
     def views(self, of_cameras: Sequence[View]) -> tuple[View, ...]:
-        """Return a view of every camera at every moment; the first camera is for testing.
+        """Return a view of every camera at every moment it has; the first camera is for testing.
 
         Args:
             of_cameras: a view of each camera that was found, whose name is its number.
@@ -72,6 +74,7 @@ class Rig:
             )
             for i, view in enumerate(of_cameras)
             for k, time in enumerate(self.times)
+            if k not in self.missing.get(int(view.name), ())
         )
 
 
@@ -107,6 +110,8 @@ def write_rig(
 ) -> None:
     """Write the pictures of all cameras at up to ``most`` common moments, and what finds them.
 
+    Videos that cannot be read are left out, and moments of which a camera has lost the frame.
+
     Args:
         folder: to write.
         source: the videos.
@@ -116,7 +121,7 @@ def write_rig(
         on_progress: called with the frames read, and of how many.
 
     Raises:
-        DataError: there are too few cameras, they differ in size or do not stand still, or their
+        DataError: too few cameras can be read, they differ in size or do not stand still, or their
             films do not overlap.
         UsageError: an offset is for a camera that is not there.
     """
@@ -126,30 +131,34 @@ def write_rig(
             raise UsageError(f"--offset {name}: is no camera; {nearest(name, names)}")
     if len(names) < LEAST:
         raise DataError(f"{source.root}: {len(names)} videos; a rig has at least {LEAST} cameras")
-    total = 2 * sum(video_length(path) for path in source.files)
+    total = 2 * sum(map(_length, source.files))
     counted = count_calls(lambda done: on_progress(done, max(done, total)))
-    clocks = [_read_clock(path, offsets.get(path.stem, 0.0), counted) for path in source.files]
-    moments = common_moments(clocks, most, source.root)
+    clocks, broken = _read_clocks(source, offsets, counted)
+    files, names = list(clocks), [path.stem for path in clocks]
+    moments = common_moments([*clocks.values()], most, source.root)
     (folder / _MOMENTS).mkdir()
     (folder / PICTURES).mkdir()
-    sizes = []
-    for camera, (path, clock) in enumerate(zip(source.files, clocks, strict=True)):
-        nearest_frames = np.abs(clock[None] - moments[:, None]).argmin(axis=1)
-        sizes.append(_write_moments(folder, camera, path, nearest_frames, max_side, counted))
+    sizes, missing = [], {}
+    for camera, (path, clock) in enumerate(clocks.items()):
+        frames = frames_at(clock, moments)
+        missing[camera] = (frames < 0).nonzero()[0].tolist()
+        sizes.append(_write_moments(folder, camera, path, frames, max_side, counted))
         if sizes[-1] != sizes[0]:
             raise DataError(
-                f"{path}: its pictures have another shape than those of {source.files[0].name}; "
+                f"{path}: its pictures have another shape than those of {files[0].name}; "
                 "the cameras of a rig share one lens"
             )
-        _write_reference(folder, camera, len(moments), path)
+        _write_reference(folder, camera, (frames >= 0).nonzero()[0], path)
     times = (moments - moments[0]).tolist()
-    write_json(folder / _RIG, {"cameras": names, "times": times})
+    write_json(folder / _RIG, {"cameras": names, "times": times, "missing": [*missing.values()]})
+    doubts = doubts_about([path.name for path in files], [*clocks.values()], moments)
     taken = [asdict(Candidate(name, 0, float(i))) for i, name in enumerate(names)]
     write_json(
         folder / NOTE,
         {
             "frames": taken, "blurred": [], "cuts": [], "plain": 0,
-            "high_range": high_ranges(source.files), "of_pictures": True, "in_seconds": False,
+            "high_range": high_ranges(files), "doubts": broken + doubts,
+            "of_pictures": True, "in_seconds": False,
             "size": sizes[0], "original_size": sizes[0], "focal": None,
         },
     )  # fmt: skip
@@ -159,6 +168,38 @@ def count_calls(on_progress: Callable[[int], None]) -> Callable[[], None]:
     """Return a function that reports, at each call, how often it has been called."""
     numbers = count(1)
     return lambda: on_progress(next(numbers))
+
+
+def _length(path: Path) -> int:
+    """Return how many frames a video announces, 0 if it cannot be opened."""
+    try:
+        return video_length(path)
+    except DataError:
+        return 0
+
+
+def _read_clocks(
+    source: Source, offsets: Mapping[str, float], counted: Callable[[], None]
+) -> tuple[dict[Path, Floats], list[str]]:
+    """Return the times of the frames of every video that can be read, and a sentence on the others.
+
+    Raises:
+        DataError: too few can be read.
+    """
+    clocks: dict[Path, Floats] = {}
+    broken = []
+    for path in source.files:
+        try:
+            clocks[path] = _read_clock(path, offsets.get(path.stem, 0.0), counted)
+        except DataError as error:
+            reason = str(error).removeprefix(f"{path}: ")
+            broken.append(f"{path.name} is left out of the rig: {reason}")
+    if len(clocks) < LEAST:
+        raise DataError(
+            f"{source.root}: {len(clocks)} of {len(source.files)} videos can be read; a rig has at "
+            f"least {LEAST} cameras; {broken[0]}"
+        )
+    return clocks, broken
 
 
 def _read_clock(path: Path, ahead: float, counted: Callable[[], None]) -> Floats:
@@ -192,31 +233,20 @@ def _write_moments(
 def read_rig(folder: Path) -> Rig:
     """Return what ``write_rig`` has written."""
     note = read_json(folder / _RIG)
-    return Rig(folder / _MOMENTS, tuple(note["cameras"]), tuple(note["times"]))
+    missing = dict(enumerate(map(frozenset, note.get("missing", ()))))
+    return Rig(folder / _MOMENTS, tuple(note["cameras"]), tuple(note["times"]), missing)
 
 
-def common_moments(clocks: Sequence[Floats], most: int, root: Path) -> Floats:
-    """Return up to ``most`` moments, evenly over the time in which all cameras film.
-
-    As many as the slowest camera has frames there, if those are fewer.
-
-    Raises:
-        DataError: there is no such time.
-    """
-    first, last = max(clock[0] for clock in clocks), min(clock[-1] for clock in clocks)
-    inside = [int(((clock >= first) & (clock <= last)).sum()) for clock in clocks]
-    if last <= first or min(inside) < 2:
-        raise DataError(f"{root}: the cameras do not film at the same time; check --offset")
-    return np.linspace(first, last, min(most, *inside))
-
-
-def _write_reference(folder: Path, camera: int, moments: int, path: Path) -> None:
-    """Write the median of a few moments of a camera.
+def _write_reference(folder: Path, camera: int, moments: NDArray[np.int64], path: Path) -> None:
+    """Write the median of a few of the moments at which a camera has frames.
 
     Raises:
-        DataError: the camera does not stand still.
+        DataError: there are none, or the camera does not stand still.
     """
-    chosen = np.linspace(0, moments - 1, min(MEDIAN_OF, moments)).round().astype(int)
+    if not len(moments):
+        raise DataError(f"{path}: has no frame at any of the moments that are taken; move it away")
+    count = min(MEDIAN_OF, len(moments))
+    chosen = moments[np.linspace(0, len(moments) - 1, count).round().astype(int)]
     pictures = [read_image(folder / _MOMENTS / _file_name(camera, int(k))) for k in chosen]
     if shift(pictures[0], pictures[-1]) > STILL * max(pictures[0].shape):
         raise DataError(

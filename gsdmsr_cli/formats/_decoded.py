@@ -31,6 +31,9 @@ _ELSEWHERE = (
 )
 """What to do where the frames of videos cannot be written."""
 
+_UNEVEN = 0.25
+"""By how much of a step, at most, times of evenly spaced frames are off."""
+
 _PART = ".part"
 _STALE = re.compile(rf"\.images\.[0-9a-f]{{32}}{re.escape(_PART)}")
 """What a killed process leaves of a video that it was decoding."""
@@ -75,6 +78,9 @@ def decode_videos(
 ) -> None:
     """Decode videos whose frames are not there yet, each to all of its frames or none.
 
+    Where some are broken, the others are decoded all the same. Frames are named by their numbers,
+    from 0; where a video has lost frames, by its times, their numbers are left out.
+
     Args:
         folder: of the data set.
         videos: to decode.
@@ -83,7 +89,7 @@ def decode_videos(
         on_progress: called with the frames decoded, and of how many.
 
     Raises:
-        DataError: a video cannot be decoded, or a frame not be written.
+        DataError: videos cannot be decoded, or a frame not be written.
     """
     wanted = [video for video in videos if not frames_of(place, video.stem).is_dir()]
     if wanted and place.parent == kept_frames():
@@ -91,15 +97,33 @@ def decode_videos(
             f"{folder} cannot be written, so its videos are decoded into {place}; "
             f"{FOLDER_VARIABLE} would name another folder"
         )
-    done, total = 0, sum(map(video_length, wanted))
+    done, total = 0, sum(map(_length, wanted))
 
     def count() -> None:
         nonlocal done
         done += 1
         on_progress(done, max(done, total))
 
+    broken = []
     for video in wanted:
-        _decode(video, frames_of(place, video.stem), halved_from, count)
+        try:
+            _decode(video, frames_of(place, video.stem), halved_from, count)
+        except DataError as error:
+            if not str(error).startswith(f"{video}: "):
+                raise  # it is no fault of the video
+            broken.append(error)
+    if broken:
+        others = f"; so are {len(broken) - 1} more" if len(broken) > 1 else ""
+        names = "".join(f", {str(error).partition(': ')[0]}" for error in broken[1:])
+        raise DataError(f"{broken[0]}{others}{names}; frames of the other videos are kept")
+
+
+def _length(video: Path) -> int:
+    """Return how many frames a video announces, 0 if it cannot be opened."""
+    try:
+        return video_length(video)
+    except DataError:
+        return 0
 
 
 def _decode(video: Path, target: Path, halved_from: int, count: Callable[[], None]) -> None:
@@ -116,9 +140,14 @@ def _decode(video: Path, target: Path, halved_from: int, count: Callable[[], Non
                 if _STALE.fullmatch(stale.name):
                     shutil.rmtree(stale, ignore_errors=True)
             beside.mkdir()
-            for i, (_, picture) in enumerate(read_video(video)):
+            times = []
+            for i, (time, picture) in enumerate(read_video(video)):
                 write_png(beside / f"{i:04d}.png", _halved(picture, halved_from))
+                times.append(time)
                 count()
+            for i, number in reversed([*enumerate(numbers_of(times))]):
+                if number > i:
+                    (beside / f"{i:04d}.png").rename(beside / f"{number:04d}.png")
             beside.replace(target)
         except OSError as error:
             reason = error.strerror or error
@@ -128,6 +157,24 @@ def _decode(video: Path, target: Path, halved_from: int, count: Callable[[], Non
             ) from error
         finally:
             shutil.rmtree(beside, ignore_errors=True)
+
+
+def numbers_of(times: Sequence[float]) -> list[int]:
+    """Return the numbers of frames, between which some are left out where frames have been lost.
+
+    Args:
+        times: of the frames, ascending [s]. Unless they lie at multiples of one step, nearly, it is
+            not known what has been lost, and the numbers are 0, 1, 2 and so on.
+    """
+    steps = np.diff(times)
+    plain = list(range(len(times)))
+    if not len(steps):
+        return plain
+    multiples = steps / float(np.median(steps))
+    whole = np.rint(multiples)
+    if whole.min() < 1 or float(np.abs(multiples - whole).max()) > _UNEVEN:
+        return plain
+    return [0, *whole.astype(int).cumsum().tolist()]
 
 
 def _halved(picture: NDArray[np.uint8], halved_from: int) -> NDArray[np.uint8]:

@@ -8,6 +8,7 @@ as well, or to a folder of the user's.
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +18,7 @@ from gsdmsr_cli.formats import _checks as checks
 from gsdmsr_cli.formats import _world
 from gsdmsr_cli.formats._arrays import read_npy
 from gsdmsr_cli.formats._decoded import decode_videos, frames_of, place_of_frames
+from gsdmsr_cli.ground import say
 from gsdmsr_cli.ground.errors import DataError
 from gsdmsr_cli.ground.progress import OnProgress
 from gsdmsr_cli.scene.camera import Camera
@@ -27,6 +29,9 @@ SIGN = "poses_bounds.npy and cam00.mp4 or cam00/images"
 
 HALVED_FROM = 2000
 """Videos as wide as this are halved, as in the papers [px]."""
+
+SHOWN = 3
+"""At most so many cameras are named of which pictures are missing."""
 
 FRAME_RATE = 30.0
 """Of all videos of the data set [1 / s]."""
@@ -73,25 +78,27 @@ def read(folder: Path, place: Path) -> Scene:
     rows = _rows(path, len(names))
     folders = [_own_or_decoded(folder, place, name) for name in names]
     pictures = [sorted(own.glob("*.png")) for own in folders]
-    longest = max(map(len, pictures))
     for own, found in zip(folders, pictures, strict=True):
         if not found:
             raise DataError(f"{own}: no PNG pictures; remove it to decode again")
+    numbers = _numbers(pictures)
+    longest = 1 + max(max(own) for own in numbers)
+    _tell_of_missing(folder, names, numbers)
     views = [
         View(
             name=f"{name}_{picture.stem}",
             camera=camera,
-            time=i / max(longest - 1, 1),
+            time=number / max(longest - 1, 1),
             split="test" if name == names[0] else "train",
             image_path=picture,
         )
-        for name, row, found in zip(names, rows, pictures, strict=True)
+        for name, row, found, own in zip(names, rows, pictures, numbers, strict=True)
         for camera in [_camera(row, found[0], f"{path}: {name}")]
-        for i, picture in enumerate(found)
+        for number, picture in zip(own, found, strict=True)
     ]
     checks.one_size(views)
     nearest, farthest = float(rows[:, 15].min()), float(rows[:, 16].max())
-    one_moment = [view for view in views if view.time == 0]
+    one_moment = list({view.camera: view for view in reversed(views)}.values())[::-1]
     world = _world.normalize(one_moment, np.zeros((0, 3)), (nearest, farthest))
     return Scene(
         root=folder,
@@ -104,6 +111,32 @@ def read(folder: Path, place: Path) -> Scene:
         fingerprint=checks.fingerprint([path]),
         decoded=place,
     )
+
+
+def _numbers(pictures: Sequence[Sequence[Path]]) -> list[list[int]]:
+    """Return the moment of every picture of every camera, from 0.
+
+    They are in the names; where a name is no number, pictures follow one another without a gap.
+    """
+    if not all(path.stem.isdecimal() for found in pictures for path in found):
+        return [list(range(len(found))) for found in pictures]
+    numbers = [[int(path.stem) for path in found] for found in pictures]
+    first = min(map(min, numbers))
+    return [[number - first for number in own] for own in numbers]
+
+
+def _tell_of_missing(folder: Path, names: Sequence[str], numbers: Sequence[Sequence[int]]) -> None:
+    """Warn of cameras that have no picture at moments that others have."""
+    known = {number for own in numbers for number in own}
+    gaps = {n: sorted(known - {*own}) for n, own in zip(names, numbers, strict=True)}
+    told = [
+        f"{name} has none at {len(gap)} of {len(known)} moments, such as the {gap[0] + 1}."
+        for name, gap in gaps.items()
+        if gap
+    ]
+    if told:
+        more = f" and {len(told) - SHOWN} more cameras have gaps" if len(told) > SHOWN else ""
+        say.warn(f"{folder}: pictures are missing: {'; '.join(told[:SHOWN])}{more}")
 
 
 def _cameras(folder: Path) -> list[str]:

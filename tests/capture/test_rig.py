@@ -12,7 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from test_prepare import prepare
 
-from gsdmsr_cli.capture.rig import common_moments, parse_offsets, shift
+from gsdmsr_cli.capture.clocks import common_moments
+from gsdmsr_cli.capture.rig import parse_offsets, shift
 from gsdmsr_cli.formats import read_scene
 from gsdmsr_cli.ground.errors import DataError, UsageError
 from gsdmsr_cli.scene.imaging import read_image

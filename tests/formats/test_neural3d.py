@@ -12,8 +12,11 @@ import numpy as np
 import pytest
 from datasets import noise, write_picture
 from full_disk import full_at_every_change, has_failed
+from hypothesis import given
+from hypothesis import strategies as st
 from neural3d_videos import CAMERAS, FRAMES, WIDTH, encode, row, write_n3v
 from refusals import assert_refused
+from videos import TICKS, write_video
 
 from gsdmsr_cli.formats import _decoded, needs_preparing, read_scene
 from gsdmsr_cli.ground.errors import DataError
@@ -255,3 +258,63 @@ def test_a_folder_of_somebody_else_beside_the_frames_is_left_alone(folder: Path)
     mine.mkdir(parents=True)
     read_scene(folder)
     assert mine.is_dir()
+
+
+def test_a_video_that_has_lost_frames_keeps_its_times_and_is_named(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The second camera has lost the third and fourth of six frames."""
+    for name, taken in (("cam00", range(6)), ("cam01", (0, 1, 4, 5)), ("cam02", range(6))):
+        pictures = [np.full((48, 64, 3), 40 * i + 20, np.uint8) for i in taken]
+        ticks = [i * TICKS // 30 for i in taken]
+        write_video(folder / f"{name}.mp4", pictures, "mpeg4", ticks=ticks)
+    scene = read_scene(folder)
+    assert [view.time for view in scene.views[6:10]] == [0.0, 0.2, 0.8, 1.0]
+    assert scene.views[8].name == "cam01_0004" and len(scene.views) == 16
+    for view in scene.views:
+        assert read_image(view.image_path).mean() == pytest.approx(200 * view.time + 20, abs=6)
+    told = "scene: pictures are missing: cam01 has none at 2 of 6 moments, such as the 3."
+    assert told in capsys.readouterr().err
+
+
+def test_a_picture_that_is_missing_shifts_no_others(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = {view.name: view for view in read_scene(folder).views}
+    assert not capsys.readouterr().err
+    for camera, name in (("cam01", "0000.png"), ("cam02", "0003.png")):
+        (folder / camera / "images" / name).unlink()
+    after = read_scene(folder).views
+    assert {view.name: view.time for view in after} == {
+        name: view.time for name, view in before.items() if name not in ("cam01_0000", "cam02_0003")
+    }
+    for view in after:
+        np.testing.assert_array_equal(view.camera.centre, before[view.name].camera.centre)
+    told = capsys.readouterr().err
+    assert "cam01 has none at 1 of 5 moments, such as the 1.; cam02 has none at 1 of 5" in told
+
+
+def test_broken_videos_among_many_are_named_and_the_others_decoded(folder: Path) -> None:
+    for name in ("cam00.mp4", "cam02.mp4"):
+        (folder / name).write_bytes((folder / name).read_bytes()[:200])
+    with pytest.raises(DataError, match=r"cam00\.mp4: no video stream") as caught:
+        read_scene(folder)
+    text = str(caught.value)
+    assert text.endswith("so are 1 more, " + str(folder / "cam02.mp4") + "; frames of the other "
+                         "videos are kept")  # fmt: skip
+    assert len(list((folder / "cam01" / "images").iterdir())) == FRAMES
+
+
+@given(st.lists(st.integers(1, 5), min_size=1, max_size=60), st.floats(0.001, 1))
+def test_frames_are_numbered_by_their_times(gaps: list[int], step: float) -> None:
+    most = [1, 1, *gaps, *[1] * len(gaps)]  # so that the usual gap is one step
+    times = np.cumsum([0, *most]) * step
+    assert _decoded.numbers_of(times.tolist()) == np.cumsum([0, *most]).tolist()
+
+
+def test_uneven_frames_are_numbered_in_their_order() -> None:
+    assert _decoded.numbers_of([0.0, 0.1, 0.25, 0.35]) == [0, 1, 2, 3]
+    assert _decoded.numbers_of([0.0, 1.0, 1.01, 2.0]) == [0, 1, 2, 3]
+    assert _decoded.numbers_of([0.0]) == [0] and _decoded.numbers_of([]) == []
+    drifting = [round(i / 30, 3) for i in range(2000)]  # as WebM counts
+    assert _decoded.numbers_of(drifting) == list(range(2000))
