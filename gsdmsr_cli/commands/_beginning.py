@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from contextlib import ExitStack
+from dataclasses import replace
 from typing import Any
 
 from gsdmsr_cli.commands._choice import Choice
@@ -16,7 +17,7 @@ from gsdmsr_cli.options import strict
 from gsdmsr_cli.options.preset import Preset, TrainingOptions, load_preset
 from gsdmsr_cli.runs.checkpoints import Checkpoint
 from gsdmsr_cli.runs.outputs import OUTPUTS
-from gsdmsr_cli.runs.run import Run, continue_run, create_run, open_run, refuse_used
+from gsdmsr_cli.runs.run import Run, continue_run, create_run, is_run, open_run, refuse_used
 from gsdmsr_cli.runs.seen_pictures import check_whole
 from gsdmsr_cli.scene.scene import Scene
 from gsdmsr_cli.training.request import Request
@@ -28,6 +29,10 @@ MAY_CHANGE = (
     "training.keep", "data.cache_mib",
 )  # fmt: skip
 """Options that a resumed training may have otherwise: its length, and what changes no result."""
+
+
+class _CompleteError(UsageError):
+    """There is nothing left to train."""
 
 
 class Anew:
@@ -108,7 +113,7 @@ class Resumed:
         """Raise UsageError if the training is complete; one that was killed as it ended is not."""
         checkpoint = self._checkpoint
         if is_complete(self._earlier, checkpoint, self.options.training):
-            raise UsageError(
+            raise _CompleteError(
                 f"{self._earlier.root}: is complete at step {checkpoint.step} after "
                 f"{checkpoint.elapsed:.0f} s; give it a longer --budget or more --steps"
             )
@@ -135,6 +140,27 @@ class Resumed:
 
 
 Beginning = Anew | Resumed
+
+
+def after_restart(request: Request, job: str) -> Request | None:
+    """Return how a training goes on of which torchrun has started all ranks anew.
+
+    What the job has begun, it goes on with; what lies there from before is treated as asked.
+
+    Returns:
+        None where the job had come to its end.
+    """
+    if not is_run(request.out) or open_run(request.out).job != job:
+        say.warn(f"{request.out}: holds nothing of this job, which begins again")
+        return request
+    if not open_run(request.out).has_checkpoint:
+        return replace(request, overwrite=True, resume=False)
+    again = replace(request, overwrite=False, resume=True)
+    try:
+        Resumed(again, ExitStack())
+    except _CompleteError:
+        return None
+    return again
 
 
 def is_complete(run: Run, checkpoint: Checkpoint, length: TrainingOptions) -> bool:

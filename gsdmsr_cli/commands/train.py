@@ -3,40 +3,34 @@
 from __future__ import annotations
 
 import shlex
-import time
-from collections.abc import Callable
 from contextlib import ExitStack
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import torch
-
 from gsdmsr_cli import raster
-from gsdmsr_cli.backends.cpu.jit import set_threads, threads
+from gsdmsr_cli.backends.cpu.jit import threads
 from gsdmsr_cli.backends.cuda import availability
-from gsdmsr_cli.commands._beginning import Anew, Beginning, Resumed
+from gsdmsr_cli.commands._beginning import Anew, Beginning, Resumed, after_restart
+from gsdmsr_cli.commands._following import follow
 from gsdmsr_cli.commands._observers import OnReport, Wanted, find_observers, observing
+from gsdmsr_cli.commands._party import Party, require_suited
 from gsdmsr_cli.commands._plan import say_plan
-from gsdmsr_cli.commands._progress import progress_bar
+from gsdmsr_cli.commands._preparing import prepare, read, start_work, timed
+from gsdmsr_cli.commands._ranks import joined
 from gsdmsr_cli.commands._training_display import TrainingDisplay
 from gsdmsr_cli.commands._viewed import viewed
-from gsdmsr_cli.formats import needs_preparing, read_scene
-from gsdmsr_cli.ground import limits, machine, say
-from gsdmsr_cli.ground.errors import DataError, UsageError
+from gsdmsr_cli.ground import machine, say
+from gsdmsr_cli.ground.errors import UsageError
 from gsdmsr_cli.ground.files import write_json
 from gsdmsr_cli.ground.locks import one_of_readers, sole_writer
-from gsdmsr_cli.options.preset import BACKGROUNDS, Preset
+from gsdmsr_cli.options.preset import Preset
 from gsdmsr_cli.runs.checkpoints import SCHEMA
 from gsdmsr_cli.runs.run import Run, require_apart
-from gsdmsr_cli.scene.pictures import Pictures
 from gsdmsr_cli.scene.scene import Scene
-from gsdmsr_cli.training import memory
-from gsdmsr_cli.training.gradients.workers import processes_for
 from gsdmsr_cli.training.loop import Report, train
-from gsdmsr_cli.training.masks import check_masks
 from gsdmsr_cli.training.request import Request
 from gsdmsr_cli.training.trainer import Trainer
-from gsdmsr_cli.training.warm_up import warm_up, warm_up_motion
 
 
 def run(request: Request) -> None:
@@ -47,43 +41,102 @@ def run(request: Request) -> None:
         DataError: the data or the run folder cannot be used.
         KeyboardInterrupt: Ctrl-C ended the training; its folder holds a checkpoint to go on from.
     """
-    observers = find_observers(request.tensorboard, request.wandb)
+    with joined() as party:
+        if party.leads:
+            _lead(request, party)
+        else:
+            follow(request, party)
+
+
+def _lead(asked: Request, party: Party) -> None:
+    """Train, as the first rank if there are several."""
     with ExitStack() as held:  # folders, from before they are read until all is written there
-        there = request.out.is_dir()
-        if there:
-            held.enter_context(sole_writer(request.out))
-        beginning = Resumed(request, held) if request.resume else Anew(request, held)
-        device = raster.pick_device(request.device)
-        _require_precision(beginning.options, request.device, device)
-        held.enter_context(one_of_readers(request.data))
-        scene, load_s = _timed(lambda: _read(request))
-        beginning.suit(scene)
-        trainer, prepare_s = _timed(lambda: _prepare(scene, beginning.options, device))
+        with party.all_or_none():
+            observers = find_observers(asked.tensorboard, asked.wandb)
+            request: Request | None = asked
+            if party.restarts and party.job is not None:
+                request = after_restart(asked, party.job)
+            begun = None if request is None else _begin(request, party, held)
+        if party.tell(begun is None) or request is None or begun is None:
+            say.note(f"{asked.out}: torchrun has started a training again that is complete")
+            return
+        with party.all_or_none():
+            party.require_same(begun.scene)
+        party.tell(begun.beginning.options)
+        with party.all_or_none():
+            given = begun.scene, begun.options, party, begun.device
+            trainer, prepare_s = timed(lambda: prepare(*given))
         for text in trainer.notes:
             say.note(text)
         if request.dry_run:
-            require_apart(request.out, scene)
-            beginning.restore(trainer)
-            say_plan(trainer, beginning.name, beginning.reason, device)
+            _show_plan(trainer, begun, request)
             return
-        if not there:
+        if not begun.there:
             held.enter_context(sole_writer(request.out))  # bad data has left no empty folder
-        _train(trainer, beginning, observers, request, device, load_s + prepare_s)
+        _train(trainer, begun, observers, request, party, begun.load_s + prepare_s)
+
+
+@dataclass(frozen=True)
+class _Begun:
+    """What is known of a training once its data has been read.
+
+    Attributes:
+        there: whether the run folder has been there, and is locked.
+        beginning: how it begins.
+        device: where it computes.
+        scene: its data.
+        load_s: how long reading that took [s].
+    """
+
+    there: bool
+    beginning: Beginning
+    device: str
+    scene: Scene
+    load_s: float
+
+    @property
+    def options(self) -> Preset:
+        """All options of the training."""
+        return self.beginning.options
+
+
+def _begin(request: Request, party: Party, held: ExitStack) -> _Begun:
+    there = request.out.is_dir()
+    if there:
+        held.enter_context(sole_writer(request.out))
+    beginning = Resumed(request, held) if request.resume else Anew(request, held)
+    device = raster.pick_device(request.device)
+    _require_precision(beginning.options, request.device, device)
+    held.enter_context(one_of_readers(request.data))
+    scene, load_s = timed(lambda: read(request))
+    beginning.suit(scene)
+    require_suited(party, beginning.options, device)
+    return _Begun(there, beginning, device, scene, load_s)
+
+
+def _show_plan(trainer: Trainer, begun: _Begun, request: Request) -> None:
+    require_apart(request.out, begun.scene)
+    begun.beginning.restore(trainer)
+    say_plan(trainer, begun.beginning.name, begun.beginning.reason, begun.device)
 
 
 def _train(
     trainer: Trainer,
-    beginning: Beginning,
+    begun: _Begun,
     observers: Wanted,
     request: Request,
-    device: str,
+    party: Party,
     load_s: float,
 ) -> None:
     with trainer:
-        beginning.restore(trainer)
-        folder = beginning.open_folder(trainer)
+        with party.all_or_none():
+            begun.beginning.restore(trainer)
+            folder = begun.beginning.open_folder(trainer)
+            if party.job is not None:
+                folder.belongs_to(party.job)
+        party.level(trainer)
         trainer.renderer.cache_in(folder.root)
-        timings = {"load_s": load_s, "compile_s": _start_work(trainer, device)}
+        timings = {"load_s": load_s, "compile_s": start_work(trainer, begun.device)}
         processes, began = len(trainer.workers), trainer.clock.step
         with (
             TrainingDisplay() as display,
@@ -91,7 +144,8 @@ def _train(
             viewed(folder, trainer, request.view_port) as offer,
         ):
             finished = train(trainer, folder, _all(display.show, hand_on, offer), say.warn)
-    account = _write_account(folder, trainer, device, timings, processes)
+    with party.all_or_none():
+        account = _write_account(folder, trainer, begun.device, timings, processes)
     _say_end(folder, trainer, request.data, finished)
     if not finished:
         raise KeyboardInterrupt
@@ -118,56 +172,6 @@ def _require_precision(options: Preset, wanted: str, device: str) -> None:
     raise UsageError(f"training.precision is {precision}; allowed on the CPU: float32; {reason}")
 
 
-def _read(request: Request) -> Scene:
-    if request.dry_run and needs_preparing(request.data):
-        raise DataError(f"{request.data}: its videos must be decoded, and a dry run writes nothing")
-    with progress_bar("decoding videos") as on_progress:
-        return read_scene(request.data, on_progress)
-
-
-def _prepare(scene: Scene, options: Preset, device: str) -> Trainer:
-    """Return a training that has read its pictures."""
-    set_threads(options.training.threads)
-    torch.set_num_threads(1)  # what torch itself computes in a step is too little to share
-    _warn_of_memory(scene, options, device)
-    pictures = Pictures(
-        BACKGROUNDS[options.data.background], options.data.downscale, options.data.cache_mib << 20
-    )
-    _preload(pictures, scene)
-    doubt = check_masks(pictures, scene.split("train"))
-    if doubt is not None:
-        say.warn(doubt)
-    return Trainer(scene, options, raster.best_engine(device), pictures, device)
-
-
-def _start_work(trainer: Trainer, device: str) -> float:
-    """Make all processes of a training ready for its first step; return how long that took [s]."""
-
-    given = trainer.scene, trainer.preset, trainer.renderer.engine
-
-    def prepare_worker() -> None:
-        warm_up_motion(*given)
-        warm_up(*given)
-
-    started = time.perf_counter()
-    if device == "cpu":
-        trainer.start_workers(prepare_worker)
-    warm_up(*given, device)
-    trainer.workers.wait()
-    return time.perf_counter() - started
-
-
-def _preload(pictures: Pictures, scene: Scene) -> None:
-    with progress_bar("reading pictures") as on_progress:
-        pictures.preload(scene.split("train"), on_progress)
-
-
-def _timed(work: Callable[[], Any]) -> tuple[Any, float]:
-    started = time.perf_counter()
-    result = work()
-    return result, time.perf_counter() - started
-
-
 def _write_account(
     folder: Run, trainer: Trainer, device: str, timings: dict[str, float], processes: int
 ) -> dict[str, Any]:
@@ -187,18 +191,10 @@ def _write_account(
         "threads": threads(),
         "processes": processes,
         "versions": machine.versions(),
+        **trainer.ranks.account(),
     }
     write_json(folder.training_path, account)
     return account
-
-
-def _warn_of_memory(scene: Scene, options: Preset, device: str) -> None:
-    """Say so if the training may take more memory than there is."""
-    processes = processes_for(options.training.views_per_step) if device == "cpu" else 1
-    expected = memory.estimate(scene.split("train"), options, processes)
-    text = memory.warning(expected, limits.available_memory())
-    if text is not None:
-        say.warn(text)
 
 
 def _say_end(folder: Run, trainer: Trainer, data: Path, finished: bool) -> None:

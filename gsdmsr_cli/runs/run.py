@@ -6,6 +6,7 @@
     RUN/checkpoint.safetensors   the last checkpoint, with its state as JSON in the header
     RUN/checkpoints/             earlier ones, if any are kept: step-001200.safetensors
     RUN/training.json     how long the training took, on which machine
+    RUN/torchrun.json     which call of torchrun has begun or resumed it, if one has
 
 Every file is written beside its place and then moved there, so an interrupted write leaves the
 earlier one. The folder can be moved; nothing in it is pickled.
@@ -45,6 +46,7 @@ from gsdmsr_cli.scene.scene import Scene
 
 _READ = 1, SCHEMA
 _ABOUT, _LOG, _TRAINING = "run.json", "metrics.jsonl", "training.json"
+_JOB = "torchrun.json"
 
 
 @dataclass(frozen=True)
@@ -97,6 +99,29 @@ class Run:
     def training_path(self) -> Path:
         """How long the training took and what it ran on."""
         return self.root / _TRAINING
+
+    @property
+    def has_checkpoint(self) -> bool:
+        """Whether there is a checkpoint to go on from."""
+        return self.checkpoint_path.is_file() or bool(checkpoints.kept(self.root))
+
+    @property
+    def job(self) -> str | None:
+        """The call of torchrun that has begun or resumed the training last, None if none has.
+
+        Raises:
+            DataError: the file that says so cannot be read.
+        """
+        path = self.root / _JOB
+        return str(read_json(path).get("job")) if path.is_file() else None
+
+    def belongs_to(self, job: str) -> None:
+        """Note which call of torchrun has begun or resumed the training.
+
+        Raises:
+            DataError: it cannot be written.
+        """
+        write_json(self.root / _JOB, {"job": job})
 
     def account(self, step: int) -> dict[str, Any]:
         """Return how long the training took that ended at ``step``; {} if none has ended there.
@@ -178,7 +203,7 @@ class Run:
             DataError: there is none, or it is damaged.
         """
         path = self.checkpoint_path
-        if not path.is_file() and not checkpoints.kept(self.root):
+        if not self.has_checkpoint:
             raise DataError(
                 f"{self.root}: the run has no checkpoint yet; train it again with --overwrite"
             )
@@ -385,7 +410,7 @@ def _clear(root: Path) -> None:
     """
     remove_leftovers(root)
     checkpoints.remove(root)
-    for name in (_LOG, _TRAINING, seen_pictures.PICTURES):
+    for name in (_LOG, _TRAINING, _JOB, seen_pictures.PICTURES):
         (root / name).unlink(missing_ok=True)
 
 

@@ -130,7 +130,7 @@ def _make_steps(
     trainer.clock.start()
     interval.begin()
     saved = time.perf_counter()
-    while trainer.clock.progress < 1 and not wanted.is_set():
+    while _goes_on(trainer, wanted):
         interval.count(trainer.step().loss)
         if interval.is_due():
             tell()
@@ -140,6 +140,27 @@ def _make_steps(
             saved = time.perf_counter()
     if interval.losses:
         tell()
+
+
+def follow(trainer: Trainer) -> bool:
+    """Make the steps of a training that the first rank keeps; return False if they ended early.
+
+    Raises:
+        GsdmsrError: the training has diverged, or the connection to another rank is lost.
+        DataError: a picture cannot be read.
+    """
+    with _ctrl_c() as wanted:
+        trainer.clock.start()
+        while _goes_on(trainer, wanted):
+            trainer.step()
+    return not wanted.is_set()
+
+
+def _goes_on(trainer: Trainer, wanted: threading.Event) -> bool:
+    """Return whether there is another step to make; the end that any rank wants is wanted."""
+    if trainer.meet(wanted.is_set()):
+        wanted.set()
+    return trainer.clock.progress < 1 and not wanted.is_set()
 
 
 def validation_view(scene: Scene) -> View:

@@ -24,12 +24,15 @@ class Clock:
         budget: length of the training [s], or None.
         step: steps made.
         before: wall time of earlier sessions [s].
+        told: wall time of training by the clock of the first rank, where several processes go by
+            one clock [s]; else None.
     """
 
     steps: int
     budget: float | None
     step: int = 0
     before: float = 0.0
+    told: float | None = None
     _started: float | None = field(default=None, repr=False)
 
     def start(self) -> None:
@@ -39,6 +42,11 @@ class Clock:
     @property
     def elapsed(self) -> float:
         """Wall time of training, over all sessions [s]."""
+        return self.now if self.told is None else self.told
+
+    @property
+    def now(self) -> float:
+        """Wall time of training by this process's own clock [s]."""
         if self._started is None:
             return self.before
         return self.before + time.perf_counter() - self._started

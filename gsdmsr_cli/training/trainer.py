@@ -30,6 +30,7 @@ from gsdmsr_cli.training.gradients.workers import WorkerPool
 from gsdmsr_cli.training.losses import start_term
 from gsdmsr_cli.training.optimizer import Adam
 from gsdmsr_cli.training.population import Tick, start_events
+from gsdmsr_cli.training.ranks.alone import ALONE, Ranks, RanksDifferError, most_of
 from gsdmsr_cli.training.rates import learning_rates
 from gsdmsr_cli.training.resizing import Population
 from gsdmsr_cli.training.saliency import Saliency
@@ -62,6 +63,7 @@ class Trainer:
         population: the model and what is kept for each of its splats.
         clock: steps, time and progress.
         renderer: renders views and goes backward.
+        ranks: the processes that make the steps together, perhaps on other machines.
         workers: the processes that take gradients; this one alone until ``start_workers``.
         events: what changes the splats after a step, by name, in their order.
         stopwatch: adds up what the time goes into.
@@ -78,7 +80,9 @@ class Trainer:
         engine: Engine,
         pictures: Pictures,
         device: torch.device | str = "cpu",
+        ranks: Ranks = ALONE,
     ) -> None:
+        self.ranks = ranks
         self.scene, self.preset, self.device = scene, preset, torch.device(device)
         self.views = scene.split("train")
         self.renderer = TrainingRenderer(preset, engine, pictures, self.views, device)
@@ -129,7 +133,8 @@ class Trainer:
     def start_workers(self, prepare: Callable[[], object]) -> None:
         """Get workers for a step's views, until the context ends; see ``WorkerPool.start``."""
         capacity = max(self.preset.density.cap, len(self.model.splats))
-        self.workers.start(self.model, capacity, self.preset.training.views_per_step, prepare)
+        views = most_of(self.preset.training.views_per_step, self.ranks.size)
+        self.workers.start(self.model, capacity, views, prepare)
 
     def step(self) -> Step:
         """Choose views, take their gradients, let Adam step, let events change the splats."""
@@ -142,9 +147,12 @@ class Trainer:
         with self._choices_that_count():
             orders = self._choose_views(progress)
             with self.stopwatch.of("gradients"):
-                views, penalty = self.workers.gradients(
-                    self.model, orders, phase, lambda: self._penalty(orders[0], progress)
-                )
+                own, penalty = self.workers.gradients(
+                    self.model, self.ranks.share(orders), phase,
+                    lambda: self._penalty(orders[0], progress),
+                )  # fmt: skip
+                with_screens = gated or progress < self.preset.density.until
+                views = self.ranks.gather(self.model, orders, own, with_screens)
         loss = _set_gradients(self.model, views, penalty)
         self.clock.step += 1
         loss = self._checked(loss)
@@ -159,6 +167,19 @@ class Trainer:
             if self.clock.step % averaging.EVERY == 0:
                 self._average(progress)
         return Step(loss)
+
+    def meet(self, end_wanted: bool) -> bool:
+        """Agree with the other ranks on the time; return whether any of them wants to end.
+
+        Raises:
+            RanksDifferError: they hold different models, of which none is to be saved.
+            GsdmsrError: the connection to another rank is lost.
+        """
+        try:
+            return self.ranks.meet(self.clock, self.model, self.generator, end_wanted)
+        except RanksDifferError:
+            self.changing = True
+            raise
 
     @property
     def is_sound(self) -> bool:
