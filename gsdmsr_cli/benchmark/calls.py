@@ -8,10 +8,12 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from types import FrameType
 
 from gsdmsr_cli.ground.errors import GsdmsrError
+from gsdmsr_cli.ground.parent import end_with_parent
 
 INTERRUPTED = 130
 """Exit code of a command that Ctrl-C has ended."""
@@ -41,7 +43,7 @@ def call(*line: str) -> None:
     if interrupted or code == INTERRUPTED:
         raise KeyboardInterrupt
     if code:
-        raise GsdmsrError(_failure(line, code, "above"))
+        raise GsdmsrError(failure(line, code, "above"))
 
 
 def call_side_by_side(works: Mapping[Path, Iterator[Line]], threads: int) -> None:
@@ -74,7 +76,7 @@ def call_side_by_side(works: Mapping[Path, Iterator[Line]], threads: int) -> Non
                 log = waiting.pop(0)
                 line = next(works[log], None)
                 if line is not None:
-                    running[log] = line, _start_logged(line, log, threads)
+                    running[log] = line, start_logged(line, log, threads)
             time.sleep(_POLL_S)
             if presses > handed_on:
                 handed_on = presses
@@ -87,7 +89,7 @@ def call_side_by_side(works: Mapping[Path, Iterator[Line]], threads: int) -> Non
                 if code == INTERRUPTED:
                     presses = handed_on = presses or 1
                 elif code:
-                    failures.append(_failure(line, code, f"in {log}"))
+                    failures.append(failure(line, code, f"in {log}"))
                 else:
                     waiting.append(log)
     finally:
@@ -101,24 +103,38 @@ def call_side_by_side(works: Mapping[Path, Iterator[Line]], threads: int) -> Non
         raise GsdmsrError("; ".join(failures))
 
 
-def _start_logged(line: Line, log: Path, threads: int) -> subprocess.Popen[bytes]:
+def start_logged(
+    line: Line, log: Path, threads: int, ends_with_us: bool = False
+) -> subprocess.Popen[bytes]:
+    """Start a command that adds all it shows to a file, see ``start``."""
     log.parent.mkdir(parents=True, exist_ok=True)
     with log.open("ab") as shown:
-        return start(line, shown.fileno(), threads)
+        return start(line, shown.fileno(), threads, ends_with_us)
 
 
-def start(line: Line, shown: int, threads: int = 0) -> subprocess.Popen[bytes]:
-    """Start a command that writes all it shows to the file descriptor ``shown``."""
+def start(
+    line: Line, shown: int, threads: int = 0, ends_with_us: bool = False
+) -> subprocess.Popen[bytes]:
+    """Start a command that writes all it shows to the file descriptor ``shown``.
+
+    Args:
+        line: the command line.
+        shown: the file descriptor.
+        threads: that it may use, 0 for all.
+        ends_with_us: whether it is killed when this process is.
+    """
     command = [sys.executable, "-m", "gsdmsr_cli", *line]
     limit = {"NUMBA_NUM_THREADS": str(threads), "OMP_NUM_THREADS": str(threads)} if threads else {}
     # In a session of its own, or a terminal would interrupt it as well: a second Ctrl-C, at which
     # a training no longer waits to save what it has.
     return subprocess.Popen(
-        command, stdout=shown, stderr=shown, start_new_session=True, env=os.environ | limit
-    )
+        command, stdout=shown, stderr=shown, start_new_session=True, env=os.environ | limit,
+        preexec_fn=partial(end_with_parent, os.getpid()) if ends_with_us else None,
+    )  # fmt: skip
 
 
-def _failure(line: Line, code: int, where: str) -> str:
+def failure(line: Line, code: int, where: str) -> str:
+    """Return what is said of a command that has failed."""
     return (
         f"gsdmsr {line[0]} has failed with exit code {code}, its message stands {where}; what is "
         "finished stays, and the same command goes on from there"

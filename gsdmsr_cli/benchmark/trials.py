@@ -36,6 +36,7 @@ class Terms:
         lpips_weights: folder of weights, or None for the usual places.
         jobs: how many run side by side.
         cpu_threads: of each, None for its share of the cores.
+        workers: of Ray, see ``on_ray.connected``; None runs trials here.
     """
 
     downscale: int
@@ -44,12 +45,15 @@ class Terms:
     lpips_weights: Path | None
     jobs: int = 1
     cpu_threads: int | None = None
+    workers: str | None = None
 
     @property
     def threads(self) -> int | None:
         """CPU threads of each, None for what its preset says."""
         if self.cpu_threads is not None:
             return self.cpu_threads
+        if self.workers is not None:
+            return 1
         return cores() // self.jobs if self.jobs > 1 else None
 
 
@@ -139,9 +143,9 @@ def run_trial(trial: Trial, root: Path, terms: Terms) -> dict[str, Any]:
         GsdmsrError: training or evaluation has failed; its own message stands above.
         KeyboardInterrupt: Ctrl-C; the training has saved a checkpoint.
     """
-    for line in _left_to_do(trial, root, terms):
+    for line in left_to_do(trial, root, terms):
         call(*line)
-    return _report(trial, root)
+    return report_of(trial, root)
 
 
 def run_side_by_side(trials: Sequence[Trial], root: Path, terms: Terms) -> list[dict[str, Any]]:
@@ -151,12 +155,13 @@ def run_side_by_side(trials: Sequence[Trial], root: Path, terms: Terms) -> list[
         DataError, GsdmsrError, KeyboardInterrupt: see ``run_trial``; the others are finished, or
             interrupted as well.
     """
-    works = {trial.log(root): _left_to_do(trial, root, terms) for trial in trials}
+    works = {trial.log(root): left_to_do(trial, root, terms) for trial in trials}
     call_side_by_side(works, terms.threads or cores())
-    return [_report(trial, root) for trial in trials]
+    return [report_of(trial, root) for trial in trials]
 
 
-def _report(trial: Trial, root: Path) -> dict[str, Any]:
+def report_of(trial: Trial, root: Path) -> dict[str, Any]:
+    """Return the ``metrics.json`` of a trial that has come to its end."""
     return read_json(_report_path(trial, root))
 
 
@@ -164,7 +169,7 @@ def _report_path(trial: Trial, root: Path) -> Path:
     return trial.folder(root) / EVALUATION / METRICS
 
 
-def _left_to_do(trial: Trial, root: Path, terms: Terms) -> Iterator[Line]:
+def left_to_do(trial: Trial, root: Path, terms: Terms) -> Iterator[Line]:
     """Yield the commands that are still to be run, each once those before have ended.
 
     Raises:

@@ -22,7 +22,7 @@ PANELS = {
         "out", "overwrite", "keep", "keep_stages", "report", "dry_run", "tensorboard", "wandb",
         "live", "port",
     ),
-    "Machine": ("device", "threads", "jobs"),
+    "Machine": ("device", "threads", "jobs", "workers", "ranks"),
 }  # fmt: skip
 """Names of functions' parameters by the panel of their options."""
 

@@ -70,6 +70,12 @@ def scenes(
     threads: Annotated[
         int | None, typer.Option(min=1, metavar="N", help="CPU threads of each trial.")
     ] = None,
+    workers: Annotated[
+        str | None,
+        typer.Option(
+            metavar="ray://HOST:PORT|auto|N", help="Run trials on a cluster of Ray; needs ray."
+        ),
+    ] = None,
 ) -> None:
     """Train presets on scenes at equal lengths and print the table of their scores."""
     lengths: list[str | int] = [*(budget or []), *(steps or [])]
@@ -78,7 +84,9 @@ def scenes(
     from gsdmsr_cli.benchmark.trials import Terms
     from gsdmsr_cli.commands import benchmark_scenes as command
 
-    terms = Terms(downscale, background, split, lpips_weights, jobs, threads)
+    if workers is not None and jobs > 1:
+        raise UsageError("--jobs and --workers are both given; drop one")
+    terms = Terms(downscale, background, split, lpips_weights, jobs, threads, workers)
     presets: list[str | Path] = [*(preset or []), *(config or [])]
     command.run(folders, out, presets or ["dnerf"], lengths, seed or [0], terms)
 
@@ -93,6 +101,9 @@ def resume(
     ] = 4,
     kills: Annotated[int, typer.Option(min=1, metavar="N", help="Trainings to kill.")] = 20,
     seed: Annotated[int, typer.Option(min=0, metavar="N", help="Seed of the moments.")] = 0,
+    ranks: Annotated[
+        int, typer.Option(min=1, metavar="N", help="Ranks of torchrun, one of which is killed.")
+    ] = 1,
     overrides: Annotated[
         list[str] | None, typer.Option("--set", metavar="a.b=v", help="One option; repeatable.")
     ] = None,
@@ -101,7 +112,7 @@ def resume(
     from gsdmsr_cli.commands import benchmark_resume as command
 
     asked = [f"training.steps={steps}", f"data.downscale={downscale}", *(overrides or [])]
-    command.run(folder, out, preset, asked, kills, seed)
+    command.run(folder, out, preset, asked, kills, seed, ranks)
 
 
 def still(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import os
 import platform
 from collections.abc import Iterator, Mapping
@@ -20,7 +21,6 @@ _INTERRUPTED = 130
 
 _MARK = "TORCHELASTIC_RUN_ID"
 """What torchrun sets and nobody else: RANK and WORLD_SIZE stand in other environments as well."""
-
 
 _RESTARTS = "TORCHELASTIC_RESTART_COUNT"
 
@@ -123,18 +123,20 @@ def joined() -> Iterator[Party]:
     if _MARK not in os.environ or "RANK" not in os.environ:
         yield Party()
         return
-    from torch import distributed
-
+    distributed: Any = importlib.import_module("torch.distributed")
     if not distributed.is_available() or not distributed.is_gloo_available():
         raise UsageError("this build of torch has no gloo, which connects ranks; install another")
+    restarts, beside = (int(os.environ.get(n, "0")) for n in (_RESTARTS, "LOCAL_WORLD_SIZE"))
     try:
-        distributed.init_process_group("gloo")
+        store, rank, size = next(iter(distributed.rendezvous("env://")))
+        # torchrun keeps its store over restarts, and with it addresses of ranks that are no more
+        fresh = distributed.PrefixStore(f"gsdmsr {restarts} {size}", store)
+        distributed.init_process_group("gloo", store=fresh, rank=rank, world_size=size)
     except (RuntimeError, ValueError) as error:
         raise DataError(
             f"{platform.node()} cannot reach the other ranks: {str(error).splitlines()[0][:200]}; "
             "set GLOO_SOCKET_IFNAME to the network interface that the machines share"
         ) from error
-    restarts, beside = (int(os.environ.get(n, "0")) for n in (_RESTARTS, "LOCAL_WORLD_SIZE"))
     try:
         yield _Connected(restarts, beside, _job())
     finally:

@@ -24,8 +24,11 @@ def run(
     overrides: Sequence[str],
     kills: int,
     seed: int,
+    ranks: int,
 ) -> None:
     """Train once undisturbed and ``kills`` times with a SIGKILL, and print what came of it.
+
+    With several ranks one of them gets the SIGKILL, and torchrun goes on by itself.
 
     Raises:
         UsageError: a preset or an option does not exist.
@@ -39,11 +42,11 @@ def run(
 
     def on_progress(kill: Kill) -> None:
         result = "identical" if kill.identical else "DIFFERENT"
-        say.note(f"killed after {kill.after_s:.1f} s, {_source(kill)}: {result}")
+        say.note(f"killed after {kill.after_s:.1f} s, {_source(kill, ranks)}: {result}")
 
-    found = survive(options, out, kills, seed, on_progress)
+    found = survive(options, out, kills, seed, on_progress, ranks)
     document = {"schema": SCHEMA, "kills": [asdict(kill) for kill in found]}
-    say.result(document, _table(found))
+    say.result(document, _table(found, ranks))
     different = sum(not kill.identical for kill in found)
     if different:
         raise GsdmsrError(
@@ -52,13 +55,15 @@ def run(
         )
 
 
-def _source(kill: Kill) -> str:
-    return "begun anew" if kill.step is None else f"resumed from step {kill.step}"
+def _source(kill: Kill, ranks: int) -> str:
+    if kill.step is None:
+        return "begun anew" if ranks == 1 else "it had ended"
+    return f"resumed from step {kill.step}"
 
 
-def _table(found: Sequence[Kill]) -> Table:
+def _table(found: Sequence[Kill], ranks: int) -> Table:
     table = Table("killed after", "then", "end")
     for kill in found:
         end = "identical" if kill.identical else "different"
-        table.add_row(f"{kill.after_s:.1f} s", _source(kill), end)
+        table.add_row(f"{kill.after_s:.1f} s", _source(kill, ranks), end)
     return table

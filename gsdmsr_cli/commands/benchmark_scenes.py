@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from rich.table import Table
 
 from gsdmsr_cli.benchmark.curves import charts_of
+from gsdmsr_cli.benchmark.ray_trials import run_on_ray
 from gsdmsr_cli.benchmark.scoreboard import HEADS, TEXTS, cells, markdown, rows_of
 from gsdmsr_cli.benchmark.trials import Terms, Trial, all_trials, run_side_by_side, run_trial
 from gsdmsr_cli.formats import read_scene
@@ -33,8 +35,8 @@ def run(
 ) -> None:
     """Run every trial that is still to do, and write ``table.json``, ``table.md`` and charts.
 
-    They are written after every ``terms.jobs`` trials, which run side by side, so that an
-    interrupted benchmark leaves a table.
+    They are written after every ``terms.jobs`` trials, which run side by side, or after each that
+    a worker of Ray has finished, so that an interrupted benchmark leaves a table.
 
     Raises:
         UsageError: a preset or a length does not exist, or there are more jobs than cores.
@@ -42,15 +44,31 @@ def run(
         GsdmsrError: a trial has failed.
         KeyboardInterrupt: Ctrl-C; the same command goes on.
     """
-    if terms.jobs * (terms.threads or 1) > cores():
+    if terms.workers is None and terms.jobs * (terms.threads or 1) > cores():
         asked = f"--jobs {terms.jobs}" + (f" of {terms.threads} threads" if terms.threads else "")
         raise UsageError(f"{asked}: this machine has {cores()} cores, give no more")
+    if terms.workers is not None:  # which have other working folders
+        out, scenes = out.absolute(), [scene.absolute() for scene in scenes]
+        presets = [name.absolute() if isinstance(name, Path) else name for name in presets]
+        weights = terms.lpips_weights
+        terms = replace(terms, lpips_weights=weights.absolute() if weights else None)
     trials = all_trials(scenes, presets, lengths, seeds)
     for trial in trials:  # an error now rather than after hours
         trial.options(terms)
     for scene in scenes:
         read_scene(scene)
-    scored: list[tuple[Trial, dict[str, Any]]] = []
+    run_all = _here if terms.workers is None else _on_ray
+    scored = run_all(trials, out, terms)
+    rows = rows_of(scored)
+    written = f"written to {out / 'table.md'}"
+    say.result(_document(rows, terms), _table(rows, terms), written, width=WIDTH)
+
+
+_Scored = list[tuple[Trial, dict[str, Any]]]
+
+
+def _here(trials: Sequence[Trial], out: Path, terms: Terms) -> _Scored:
+    scored: _Scored = []
     for first in range(0, len(trials), terms.jobs):
         batch = trials[first : first + terms.jobs]
         for number, trial in enumerate(batch, start=first + 1):
@@ -61,12 +79,24 @@ def run(
         else:
             documents = run_side_by_side(batch, out, terms)
         scored += zip(batch, documents, strict=True)
-        rows = rows_of(scored)
-        _write(out, rows, terms)
-        for name, chart in charts_of([trial for trial, _ in scored], out).items():
-            write_text(out / f"psnr-{name}.svg", chart)
-    written = f"written to {out / 'table.md'}"
-    say.result(_document(rows, terms), _table(rows, terms), written, width=WIDTH)
+        _write(out, scored, terms)
+    return scored
+
+
+def _on_ray(trials: Sequence[Trial], out: Path, terms: Terms) -> _Scored:
+    found: dict[Trial, dict[str, Any]] = {}
+
+    def add(trial: Trial, document: dict[str, Any]) -> None:
+        found[trial] = document
+        say.note(f"{len(found)} of {len(trials)} trials: {trial.log(out)}")
+        _write(out, _in_order(trials, found), terms)
+
+    run_on_ray(trials, out, terms, add)
+    return _in_order(trials, found)
+
+
+def _in_order(trials: Sequence[Trial], found: dict[Trial, dict[str, Any]]) -> _Scored:
+    return [(trial, found[trial]) for trial in trials if trial in found]
 
 
 def _document(rows: Sequence[dict[str, Any]], terms: Terms) -> dict[str, Any]:
@@ -79,7 +109,10 @@ def _document(rows: Sequence[dict[str, Any]], terms: Terms) -> dict[str, Any]:
     return {"schema": SCHEMA, "protocol": about, "rows": list(rows)}
 
 
-def _write(out: Path, rows: Sequence[dict[str, Any]], terms: Terms) -> None:
+def _write(out: Path, scored: _Scored, terms: Terms) -> None:
+    rows = rows_of(scored)
+    for name, chart in charts_of([trial for trial, _ in scored], out).items():
+        write_text(out / f"psnr-{name}.svg", chart)
     write_json(out / "table.json", _document(rows, terms))
     write_text(out / "table.md", markdown(rows))
 

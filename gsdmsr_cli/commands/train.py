@@ -133,7 +133,7 @@ def _train(
             begun.beginning.restore(trainer)
             folder = begun.beginning.open_folder(trainer)
             if party.job is not None:
-                folder.belongs_to(party.job)
+                folder.belongs_to(party.job, trainer.clock.step if party.restarts else None)
         party.level(trainer)
         trainer.renderer.cache_in(folder.root)
         timings = {"load_s": load_s, "compile_s": start_work(trainer, begun.device)}

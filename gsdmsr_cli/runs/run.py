@@ -115,13 +115,28 @@ class Run:
         path = self.root / _JOB
         return str(read_json(path).get("job")) if path.is_file() else None
 
-    def belongs_to(self, job: str) -> None:
-        """Note which call of torchrun has begun or resumed the training.
+    @property
+    def restarted_at(self) -> int | None:
+        """The step at which torchrun has started all ranks anew last, None if it has not.
+
+        Raises:
+            DataError: the file that says so cannot be read.
+        """
+        path = self.root / _JOB
+        step = read_json(path).get("restarted_at") if path.is_file() else None
+        return None if step is None else int(step)
+
+    def belongs_to(self, job: str, restarted_at: int | None = None) -> None:
+        """Note which call of torchrun has begun or resumed the training, and how.
+
+        Args:
+            job: see ``job``.
+            restarted_at: the step at which all ranks have been started anew, if they have.
 
         Raises:
             DataError: it cannot be written.
         """
-        write_json(self.root / _JOB, {"job": job})
+        write_json(self.root / _JOB, {"job": job, "restarted_at": restarted_at})
 
     def account(self, step: int) -> dict[str, Any]:
         """Return how long the training took that ended at ``step``; {} if none has ended there.

@@ -173,11 +173,12 @@ Gsdmsr = Any  # the fixture of conftest.py
                 ["training.steps=600", "data.downscale=4"],
                 20,
                 0,
+                1,
             ),
         ),
         (
             "benchmark resume s --out o --preset n3v --steps 9 --downscale 2 --kills 3 --seed 5"
-            " --set a.b=1",
+            " --set a.b=1 --ranks 2",
             "benchmark_resume",
             (
                 Path("s"),
@@ -186,6 +187,7 @@ Gsdmsr = Any  # the fixture of conftest.py
                 ["training.steps=9", "data.downscale=2", "a.b=1"],
                 3,
                 5,
+                2,
             ),
         ),
         ("benchmark still r", "benchmark_still", (Path("r"), [0.1, 0.3, 1.0, 3.0], "val", None)),

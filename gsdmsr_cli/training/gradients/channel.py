@@ -6,7 +6,6 @@ A forked process gets its orders over a pipe; model and gradients lie in memory 
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import multiprocessing
 import os
 import signal
@@ -22,6 +21,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from gsdmsr_cli.ground.errors import GsdmsrError
+from gsdmsr_cli.ground.parent import end_with_parent
 from gsdmsr_cli.model.model import Model
 from gsdmsr_cli.scene.native import one_opencv_thread
 from gsdmsr_cli.training.gradients.phase import Order, Phase, ViewGradients
@@ -32,9 +32,6 @@ _ON_SCREEN = "on screen"
 
 GRACE_SECONDS = 0.5
 """A worker is killed if it does not end by itself within so long."""
-
-_PR_SET_PDEATHSIG = 1
-"""Of prctl: the signal that a process gets when the one ends that has forked it."""
 
 
 class Channel(Protocol):
@@ -243,13 +240,6 @@ def _received(array: Any) -> Tensor | None:
     return None if array is None else torch.from_numpy(array)
 
 
-def _end_with(training: int) -> None:
-    """Let this process be killed when the training ends in any way, even while it compiles."""
-    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
-    if os.getppid() != training:
-        os._exit(1)
-
-
 def _serve(
     pipe: Connection,
     foreign: Sequence[Connection],
@@ -258,7 +248,7 @@ def _serve(
 ) -> None:
     """Do one task after another in a worker, until the training closes the pipe or ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the training to deal with
-    _end_with(os.getppid())
+    end_with_parent(os.getppid())  # even while it compiles
     torch.set_num_threads(1)  # torch's own threads have not come along
     for other in foreign:
         other.close()
