@@ -121,7 +121,7 @@ def start(
         line: the command line.
         shown: the file descriptor.
         threads: that it may use, 0 for all.
-        ends_with_us: whether it is killed when this process is.
+        ends_with_us: whether it is killed when this process is; not on Windows.
     """
     command = [sys.executable, "-m", "gsdmsr_cli", *line]
     limit = {"NUMBA_NUM_THREADS": str(threads), "OMP_NUM_THREADS": str(threads)} if threads else {}
@@ -129,8 +129,14 @@ def start(
     # a training no longer waits to save what it has.
     return subprocess.Popen(
         command, stdout=shown, stderr=shown, start_new_session=True, env=os.environ | limit,
-        preexec_fn=partial(end_with_parent, os.getpid()) if ends_with_us else None,
+        preexec_fn=partial(_depend_on, os.getpid()) if ends_with_us else None,
     )  # fmt: skip
+
+
+def _depend_on(parent: int) -> None:
+    """Let a command end with its parent, and hear Ctrl-C, which Ray's workers block."""
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+    end_with_parent(parent)
 
 
 def failure(line: Line, code: int, where: str) -> str:
