@@ -13,8 +13,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from gsdmsr_cli.capture.agreement import Film, clock_doubts
 from gsdmsr_cli.capture.candidates import Candidate
-from gsdmsr_cli.capture.clocks import Floats, common_moments, doubts_about, frames_at
+from gsdmsr_cli.capture.clocks import common_moments, doubts_about, frames_at
+from gsdmsr_cli.capture.cuts import Thumbnail, change, thumbnail
 from gsdmsr_cli.capture.features import find_features
 from gsdmsr_cli.capture.frames import NOTE, PICTURES, shrunk
 from gsdmsr_cli.capture.source import Source
@@ -133,13 +135,14 @@ def write_rig(
         raise DataError(f"{source.root}: {len(names)} videos; a rig has at least {LEAST} cameras")
     total = 2 * sum(map(_length, source.files))
     counted = count_calls(lambda done: on_progress(done, max(done, total)))
-    clocks, broken = _read_clocks(source, offsets, counted)
-    files, names = list(clocks), [path.stem for path in clocks]
-    moments = common_moments([*clocks.values()], most, source.root)
+    films, broken = _read_films(source, offsets, counted)
+    files, names = list(films), [path.stem for path in films]
+    clocks = [film.times for film in films.values()]
+    moments = common_moments(clocks, most, source.root)
     (folder / _MOMENTS).mkdir()
     (folder / PICTURES).mkdir()
     sizes, missing = [], {}
-    for camera, (path, clock) in enumerate(clocks.items()):
+    for camera, (path, clock) in enumerate(zip(files, clocks, strict=True)):
         frames = frames_at(clock, moments)
         missing[camera] = (frames < 0).nonzero()[0].tolist()
         sizes.append(_write_moments(folder, camera, path, frames, max_side, counted))
@@ -151,7 +154,8 @@ def write_rig(
         _write_reference(folder, camera, (frames >= 0).nonzero()[0], path)
     times = (moments - moments[0]).tolist()
     write_json(folder / _RIG, {"cameras": names, "times": times, "missing": [*missing.values()]})
-    doubts = doubts_about([path.name for path in files], [*clocks.values()], moments)
+    doubts = doubts_about([path.name for path in files], clocks, moments)
+    doubts += clock_doubts([*films.values()])
     taken = [asdict(Candidate(name, 0, float(i))) for i, name in enumerate(names)]
     write_json(
         folder / NOTE,
@@ -178,37 +182,41 @@ def _length(path: Path) -> int:
         return 0
 
 
-def _read_clocks(
+def _read_films(
     source: Source, offsets: Mapping[str, float], counted: Callable[[], None]
-) -> tuple[dict[Path, Floats], list[str]]:
-    """Return the times of the frames of every video that can be read, and a sentence on the others.
+) -> tuple[dict[Path, Film], list[str]]:
+    """Return what there is of every video that can be read, and a sentence on each of the others.
 
     Raises:
         DataError: too few can be read.
     """
-    clocks: dict[Path, Floats] = {}
+    films: dict[Path, Film] = {}
     broken = []
     for path in source.files:
         try:
-            clocks[path] = _read_clock(path, offsets.get(path.stem, 0.0), counted)
+            films[path] = _read_film(path, offsets.get(path.stem, 0.0), counted)
         except DataError as error:
             reason = str(error).removeprefix(f"{path}: ")
             broken.append(f"{path.name} is left out of the rig: {reason}")
-    if len(clocks) < LEAST:
+    if len(films) < LEAST:
         raise DataError(
-            f"{source.root}: {len(clocks)} of {len(source.files)} videos can be read; a rig has at "
+            f"{source.root}: {len(films)} of {len(source.files)} videos can be read; a rig has at "
             f"least {LEAST} cameras; {broken[0]}"
         )
-    return clocks, broken
+    return films, broken
 
 
-def _read_clock(path: Path, ahead: float, counted: Callable[[], None]) -> Floats:
-    """Return the time of every frame of a video, on the clock of the rig [s]."""
-    times = []
-    for time, _ in read_video(path):
+def _read_film(path: Path, ahead: float, counted: Callable[[], None]) -> Film:
+    """Return the time of every frame of a video, on the clock of the rig, and what changes."""
+    times, changes = [], []
+    last: Thumbnail | None = None
+    for time, picture in read_video(path):
         times.append(time - ahead)
+        seen = thumbnail(picture)
+        changes += [] if last is None else [change(last, seen)]
+        last = seen
         counted()
-    return np.array(times)
+    return Film(path.name, np.array(times), np.array(changes))
 
 
 def _write_moments(
