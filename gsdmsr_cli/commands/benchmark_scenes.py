@@ -119,7 +119,9 @@ def _write(out: Path, scored: _Scored, terms: Terms) -> None:
 
 def _table(rows: Sequence[dict[str, Any]], terms: Terms) -> Table:
     about = f"{terms.split} split, downscale {terms.downscale}, on {terms.background}"
-    if terms.threads:
+    if terms.workers is not None:
+        about += f", {terms.threads} CPUs each on workers of Ray"
+    elif terms.threads:
         about += f", {terms.threads} of {cores()} cores each"
     table = Table(title=about)
     for place, name in enumerate(HEADS):
