@@ -100,7 +100,7 @@ def train(
         DataError: a picture cannot be read, or the last checkpoint not be written.
     """
     keeper = Keeper(trainer, run, on_warning)
-    with _ctrl_c() as wanted:
+    with _ctrl_c(trainer.ranks.size > 1) as wanted:
         try:
             _make_steps(trainer, keeper, on_report, wanted)
         except KeyboardInterrupt:  # the second Ctrl-C, which does not wait
@@ -149,7 +149,7 @@ def follow(trainer: Trainer) -> bool:
         GsdmsrError: the training has diverged, or the connection to another rank is lost.
         DataError: a picture cannot be read.
     """
-    with _ctrl_c() as wanted:
+    with _ctrl_c(patient=True) as wanted:
         trainer.clock.start()
         while _goes_on(trainer, wanted):
             trainer.step()
@@ -238,8 +238,11 @@ def _share(rows: Tensor) -> float:
 
 
 @contextmanager
-def _ctrl_c() -> Iterator[threading.Event]:
-    """Turn Ctrl-C into an event, so that a step is finished; a second Ctrl-C does interrupt."""
+def _ctrl_c(patient: bool) -> Iterator[threading.Event]:
+    """Turn Ctrl-C into an event, so that a step is finished; a second Ctrl-C does interrupt.
+
+    It does not where one is ``patient``, as ranks are: torchrun signals twice, and kills later.
+    """
     wanted = threading.Event()
     if threading.current_thread() is not threading.main_thread():
         yield wanted  # only the main thread may handle signals
@@ -247,7 +250,8 @@ def _ctrl_c() -> Iterator[threading.Event]:
 
     def want(number: int, frame: FrameType | None) -> None:
         wanted.set()
-        signal.signal(signal.SIGINT, earlier)
+        if not patient:
+            signal.signal(signal.SIGINT, earlier)
 
     earlier = signal.getsignal(signal.SIGINT)
     signal.signal(signal.SIGINT, want)

@@ -82,6 +82,26 @@ def test_a_rank_that_is_killed_is_recovered(tiny_scene: Path, tmp_path: Path) ->
     assert same(open_run(run).load(), open_run(alone).load())
 
 
+def test_a_torchrun_that_is_ended_ends_all_ranks_after_one_step(
+    tiny_scene: Path, tmp_path: Path
+) -> None:
+    """It signals every rank twice; a single process would not wait for its step any more."""
+    run, log = tmp_path / "run", tmp_path / "log"
+    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2"]
+    command += ["-m", "gsdmsr_cli", *options(tiny_scene, run, "--steps=1000000")]
+    with log.open("w") as shown, subprocess.Popen(command, stdout=shown, stderr=shown) as torchrun:
+        end = time.monotonic() + 200
+        while not (run / "metrics.jsonl").is_file() or not open_run(run).read_log():
+            assert time.monotonic() < end and torchrun.poll() is None, log.read_text()
+            time.sleep(0.05)
+        torchrun.send_signal(signal.SIGINT)
+        torchrun.wait(timeout=100)
+    opened = open_run(run)
+    step = opened.load().step
+    assert f"interrupted at step {step}" in log.read_text() and "lost" not in log.read_text()
+    assert opened.read_log()[-1]["step"] == step and opened.account(step)
+
+
 def free_port() -> int:
     with socket.socket() as one:
         one.bind(("127.0.0.1", 0))
