@@ -12,13 +12,8 @@ from collections.abc import Collection, Sequence
 import numpy as np
 
 from gsdmsr_cli.scene.camera import Camera
+from gsdmsr_cli.scene.nearness import MOST_TURN, MOST_WAY, extent
 from gsdmsr_cli.scene.scene import View
-
-MOST_TURN = math.radians(5)
-"""Neighbouring views look in directions that differ by this at most [rad]."""
-
-MOST_WAY = 0.1
-"""And are taken from places this far apart at most, in units of how far any are from their mean."""
 
 LEAST_SHARE = 0.1
 """Where fewer of the views than this share have a neighbour, it is by chance that some have."""
@@ -39,7 +34,7 @@ def neighbours(
         moments.setdefault(view.time, []).append(view)
     times = sorted(moments)
     centres = np.stack([view.camera.centre for view in views])
-    most = MOST_WAY * float(np.linalg.norm(centres - centres.mean(0), axis=1).max())
+    most = MOST_WAY * extent(centres)
     found = {}
     for i, time in enumerate(times):
         beside = [moments[other] for other in (*times[max(i - 1, 0) : i], *times[i + 1 : i + 2])]
