@@ -130,7 +130,9 @@ def describe(trained: Trained, request: Request) -> dict[str, Any]:
         UsageError: the pictures are too small for the downscale.
     """
     options, checkpoint = trained.run.preset, trained.checkpoint
-    camera = trained.renderer.pictures.camera(trained.scene.split(request.split)[0])
+    views = trained.scene.split(request.split)
+    camera = trained.renderer.pictures.camera(views[0])
+    told = trained.renderer.model.tell_views([(view.camera, view.time) for view in views])
     return {
         "split": request.split,
         "resolution": [camera.width, camera.height],
@@ -150,6 +152,7 @@ def describe(trained: Trained, request: Request) -> dict[str, Any]:
         "pictures_fingerprint": digest(trained.scene.pictures),
         "lpips_weights": weights_hashes(request.lpips_weights),
         "conventions": protocol.CONVENTIONS,
+        **({"views": told} if told else {}),
         "versions": machine.versions(),
     }
 

@@ -23,6 +23,7 @@ def draw(
     background: Tensor,
     sh_degree: int | None = None,
     with_depth: bool = False,
+    of_capture: bool = False,
 ) -> Frame:
     """Draw the model under a camera at a time in [0, 1], or unmoved if the time is None.
 
@@ -34,10 +35,15 @@ def draw(
         background: (3,) colour behind the splats.
         sh_degree: highest degree of colour to use, all by default.
         with_depth: also blend the camera's z.
+        of_capture: whether the camera and the time are those of a view of the scene, for which
+            layers may know more of it, see ``Model.instant_of_view``.
     """
     if time is None:
         return engine.rasterize(Moment(model.splats), camera, background, sh_degree, with_depth)
-    instant = model.instant(time, camera)
+    if of_capture:
+        instant, camera = model.instant_of_view(time, camera)
+    else:
+        instant = model.instant(time, camera)
     moment = model.at(instant)
     return draw_moment(model, moment, instant, camera, engine, background, sh_degree, with_depth)
 

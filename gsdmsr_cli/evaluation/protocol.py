@@ -56,7 +56,8 @@ class ViewRenderer:
     def draw(self, view: View) -> Tensor:
         """Return the drawn picture, (H, W, 3), unclamped, in the memory of the CPU."""
         camera = self.pictures.camera(view)
-        return draw(self.model, camera, view.time, self.engine, self.background).rgb.cpu()
+        given = self.model, camera, view.time, self.engine, self.background
+        return draw(*given, of_capture=True).rgb.cpu()
 
     def true(self, view: View) -> Tensor:
         """Return the true picture, (H, W, 3) in [0, 1].

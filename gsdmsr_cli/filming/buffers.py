@@ -73,8 +73,8 @@ class BufferRenderer:
     @torch.no_grad()
     def draw(self, shot: Shot, following: Shot | None) -> Buffers:
         """Draw a shot; without a ``following`` one there is no flow."""
-        renderer, camera = self._renderer, self._camera(shot)
-        instant = renderer.model.instant(shot.time, camera)
+        renderer = self._renderer
+        instant, camera = self._seen(shot)
         moment = self._moment(instant)
         frame = draw_moment(
             renderer.model, moment, instant, camera, renderer.engine, renderer.background, None,
@@ -82,16 +82,20 @@ class BufferRenderer:
         )  # fmt: skip
         flow = None
         if self._with_flow and following is not None:
-            next_camera = self._camera(following)
-            later = self._moment(renderer.model.instant(following.time, next_camera))
+            next_instant, next_camera = self._seen(following)
+            later = self._moment(next_instant)
             flow = draw_flow(moment, camera, later, next_camera, renderer.engine)
         depth = None if frame.depth is None else frame.depth.numpy(force=True)
         moved = None if flow is None else flow.numpy(force=True)
         return Buffers(frame.rgb.numpy(force=True), frame.alpha.numpy(force=True), depth, moved)
 
-    def _camera(self, shot: Shot) -> Camera:
-        camera, factor = shot.camera, self._supersample
-        return camera.resized(camera.width * factor, camera.height * factor)
+    def _seen(self, shot: Shot) -> tuple[Instant, Camera]:
+        """Return the instant and the camera of a shot, of a view's as layers know it."""
+        model, factor = self._renderer.model, self._supersample
+        camera = shot.camera.resized(shot.camera.width * factor, shot.camera.height * factor)
+        if shot.view is not None:
+            return model.instant_of_view(shot.time, camera)
+        return model.instant(shot.time, camera), camera
 
     def _moment(self, instant: Instant) -> Moment:
         if self._kept is None or self._kept[0] != instant:

@@ -14,6 +14,7 @@ from gsdmsr_cli.model import layers as further
 from gsdmsr_cli.model import motion as motions
 from gsdmsr_cli.model.layer import Facts, Layer, options_of, start_layer
 from gsdmsr_cli.model.model import FURTHER, MOTION, MOVING, STORED_AS, Model
+from gsdmsr_cli.scene.camera import Camera
 
 
 def start_model(
@@ -25,6 +26,7 @@ def start_model(
     moving: int | None = None,
     precision: str = "float32",
     times: Tensor | None = None,
+    views: Sequence[tuple[Camera, float]] = (),
 ) -> Model:
     """Make a model of splats whose layers begin anew.
 
@@ -37,6 +39,7 @@ def start_model(
         moving: how many splats move; all if None.
         precision: see ``Model``.
         times: (N,) at which the splats were seen, see ``Layer.begin_at``.
+        views: cameras and times of the train views, see ``Layer.begin_with``.
 
     Raises:
         UsageError: there is no such motion or layer, or an option is unknown or out of range.
@@ -46,6 +49,8 @@ def start_model(
         begun[key] = start_layer(package, settings, facts, splats, generator)
         if times is not None:
             begun[key].begin_at(times)
+        if views:
+            begun[key].begin_with(views)
     return Model(splats, begun, moving, precision)
 
 

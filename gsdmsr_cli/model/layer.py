@@ -48,11 +48,14 @@ class Instant:
         camera: that they are seen by; None unless a layer ``needs_camera``.
         jitter: a standard normal random number of this view and step, on which all processes
             agree; 0 outside training and unless a layer ``needs_jitter``.
+        view: the camera, as the scene has it, of the capture's picture that is drawn; None where
+            none is, and unless a layer ``holds_views``.
     """
 
     time: float
     camera: Camera | None = None
     jitter: float = 0.0
+    view: Camera | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,6 +86,8 @@ class Layer(ABC):
             the instant; of two such layers in the order of the preset's list.
         needs_camera, needs_jitter: what it wants to know of an instant beside the time.
         shades: whether ``shade`` does anything.
+        holds_views: whether it holds something of each picture of the capture, and does nothing
+            where none of these is drawn.
     """
 
     identity_at_start: bool = True
@@ -91,6 +96,7 @@ class Layer(ABC):
     needs_camera: ClassVar[bool] = False
     needs_jitter: bool = False
     shades: ClassVar[bool] = False
+    holds_views: ClassVar[bool] = False
 
     def __init__(self, parameters: Sequence[Parameter] = ()) -> None:
         self._parameters = tuple(parameters)
@@ -106,6 +112,24 @@ class Layer(ABC):
     def shade(self, frame: Frame, instant: Instant) -> Frame:
         """Return the frame with colours made anew from what was drawn, such as features."""
         return frame
+
+    def place(self, camera: Camera, time: float) -> Camera:
+        """Return the camera that a picture of the capture is drawn by; ``camera`` is the scene's.
+
+        Called of layers that hold views alone, as are ``trace`` and ``tell_views``.
+        """
+        return camera
+
+    def trace(self, moment: Moment, instant: Instant) -> Moment:
+        """Return the moment as it is, whose gradients reach what ``place`` goes by.
+
+        The last thing before drawing, and in a training alone; ``instant.view`` says of which view.
+        """
+        return moment
+
+    def tell_views(self, views: Sequence[tuple[Camera, float]]) -> dict[str, Any]:
+        """Return what a report is to say of how these views are drawn, plain JSON."""
+        return {}
 
     def parameters(self) -> Sequence[Parameter]:
         """Return everything that is trained or saved, in a fixed order, under fixed names."""
@@ -186,6 +210,9 @@ class Layer(ABC):
 
     def begin_at(self, times: Tensor) -> None:  # noqa: B027  (most have no time of each splat)
         """Take the times (N,) at which the first splats were seen, NaN where that is not known."""
+
+    def begin_with(self, views: Sequence[tuple[Camera, float]]) -> None:  # noqa: B027  (likewise)
+        """Take the cameras and times of the train views, to hold something of each."""
 
     def reanchor(self, splats: Splats) -> Sequence[str]:
         """Adapt the layer to where the splats are now, since there are others than before.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -86,6 +87,11 @@ class Model:
         """Whether a layer wants a random number with every instant of a training."""
         return any(layer.needs_jitter for layer in self.layers.values())
 
+    @property
+    def holds_views(self) -> bool:
+        """Whether a layer holds something of each picture of the capture."""
+        return any(layer.holds_views for layer in self.layers.values())
+
     def instant(self, time: float, camera: Camera | None = None, jitter: float = 0.0) -> Instant:
         """Return the instant with what the layers want to know of it, and no more.
 
@@ -98,6 +104,39 @@ class Model:
             raise ValueError("what this model shows depends on the camera, and none is given")
         seen_by = camera if self.needs_camera else None
         return Instant(time, seen_by, jitter if self.needs_jitter else 0.0)
+
+    def instant_of_view(
+        self, time: float, camera: Camera, jitter: float = 0.0
+    ) -> tuple[Instant, Camera]:
+        """Return the instant of a picture of the capture, and the camera that it is drawn by.
+
+        ``camera`` is the scene's. ``instant`` is for cameras that have no picture there.
+        """
+        if not self.holds_views:
+            return self.instant(time, camera, jitter), camera
+        placed = self.placed(camera, time)
+        return replace(self.instant(time, placed, jitter), view=camera), placed
+
+    def placed(self, camera: Camera, time: float) -> Camera:
+        """Return the camera that a view of the capture is drawn by; ``camera`` is the scene's."""
+        for layer in self._holding_views():
+            camera = layer.place(camera, time)
+        return camera
+
+    def trace(self, moment: Moment, instant: Instant) -> Moment:
+        """Return what is drawn, whose gradients reach what layers hold of the view as well."""
+        if instant.view is not None:
+            for layer in self._holding_views():
+                moment = layer.trace(moment, instant)
+        return moment
+
+    def tell_views(self, views: Sequence[tuple[Camera, float]]) -> dict[str, Any]:
+        """Return what layers have to say of how views of the capture are drawn, by layer."""
+        found = {key: layer.tell_views(views) for key, layer in self.layers.items()}
+        return {key.removeprefix(FURTHER): told for key, told in found.items() if told}
+
+    def _holding_views(self) -> list[Layer]:
+        return [layer for layer in self.layers.values() if layer.holds_views]
 
     def at(self, instant: Instant, gradient_mask: Tensor | None = None) -> Moment:
         """Return what is drawn at ``instant``, see ``at_instants``."""

@@ -237,6 +237,14 @@ def _frames(document: Document) -> str:
     return f'<details class="card wide"><summary>All {count} frames</summary>{shown}</details>'
 
 
+def _of_views(told: Document) -> str:
+    """Return what a layer that holds something of views has done to those of the split."""
+    return (
+        f"{told['about']}; of the split {told['own']} have their own, {told['of_neighbours']} that "
+        f"of neighbours, {told['none']} none"
+    )
+
+
 def _protocol(document: Document) -> str:
     about = document["protocol"]
     width, height = about["resolution"]
@@ -245,6 +253,7 @@ def _protocol(document: Document) -> str:
         ("checkpoint", f"{about['checkpoint']}, step {about['checkpoint_step']}"),
         ("device", summary.machine(document)),
         ("data", about["data_fingerprint"]),
+        *((name, _of_views(told)) for name, told in about.get("views", {}).items()),
         *(about["conventions"].items()),
         ("versions", ", ".join(f"{name} {text}" for name, text in about["versions"].items())),
     )

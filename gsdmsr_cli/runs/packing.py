@@ -53,7 +53,8 @@ def pack(model: Model, tolerance: float = TOLERANCE) -> tuple[dict[str, Tensor],
     rows = _in_order(model)
     model.take(rows, torch.zeros_like(rows, dtype=torch.bool))
     codes = _settle(model)
-    trained = [p.name for p in model.parameters() if _is_trained(p) and p.name not in codes]
+    as_they_are = {*codes, *_of_views(model)}
+    trained = [p.name for p in model.parameters() if _is_trained(p) and p.name not in as_they_are]
     forms = forms_of(model, tolerance, trained)
     packed: dict[str, Tensor] = {}
     described: dict[str, dict[str, Any]] = {}
@@ -136,6 +137,12 @@ def _settle(model: Model) -> dict[str, Tensor]:
             layer.fitted.zero_()
             layer.check()  # which now says that there is nothing to do
     return codes
+
+
+def _of_views(model: Model) -> list[str]:
+    """Return the names of what layers hold of views: what is drawn at a time does not show it."""
+    holding = {key: layer for key, layer in model.layers.items() if layer.holds_views}
+    return [f"{key}.{one.name}" for key, layer in holding.items() for one in layer.parameters()]
 
 
 def _is_trained(parameter: Parameter) -> bool:

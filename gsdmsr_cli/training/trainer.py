@@ -96,6 +96,7 @@ class Trainer:
         model = start_model(
             splats, preset.motion, preset.layers, self.facts, self.generator,
             precision=preset.training.precision, times=times,
+            views=[(view.camera, view.time) for view in self.views],
         )  # fmt: skip
         self.optimizer = Adam()
         self.saliency = Saliency(len(splats), preset.saliency, device)

@@ -46,7 +46,8 @@ class HeldOut:
     def drawn(self, model: Model) -> bytes:
         """Return the view of a model as PNG."""
         camera = self.pictures.camera(self.view)
-        frame = draw(model, camera, self.view.time, self.engine, self.background)
+        given = model, camera, self.view.time, self.engine, self.background
+        frame = draw(*given, of_capture=True)
         return _png((255 * quantize(frame.rgb)).round().to(torch.uint8))
 
 

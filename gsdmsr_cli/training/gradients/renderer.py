@@ -74,19 +74,19 @@ class TrainingRenderer:
         if any(term.weight(phase.progress) > 0 for term in self.terms) or model.shades:
             return [self._with_terms(model, order, phase) for order in orders]
         pictures, views = self._pictures(phase.progress), [self.views[o.row] for o in orders]
-        cameras = [pictures.camera(view) for view in views]
+        seen = [
+            model.instant_of_view(view.time, pictures.camera(view), order.jitter)
+            for view, order in zip(views, orders, strict=True)
+        ]
+        instants, cameras = [one for one, _ in seen], [camera for _, camera in seen]
         targets = [self._resident.load(pictures, view) for view in views]
         masks = [pictures.signal(view, MASK) for view in views]
         weights = [self._on_device(order.tile_weights) for order in orders]
-        instants = [
-            model.instant(view.time, camera, order.jitter)
-            for view, camera, order in zip(views, cameras, orders, strict=True)
-        ]
         further = self._ssim_weight(phase.progress), self._sh_degree(phase.progress)
         together = _alike(cameras, weights) and all(mask is None for mask in masks)
-        moments: Iterable[Moment] = (self._moved(model, [one], phase)[0] for one in instants)
+        moments: Iterable[Moment] = (self._seen(model, [one], phase)[0] for one in instants)
         if together and isinstance(self.engine, ComparingViews):
-            moments = at_once = self._moved(model, instants, phase)
+            moments = at_once = self._seen(model, instants, phase)
             if all(moment.features is None for moment in at_once):
                 given = self.engine, model, at_once, cameras, self.background, targets
                 return compare_views(*given, *further, weights)
@@ -102,8 +102,8 @@ class TrainingRenderer:
     def _with_terms(self, model: Model, order: Order, phase: Phase) -> ViewGradients:
         """Draw, shade and compare a view, and add the further terms of the loss."""
         pictures, view = self._pictures(phase.progress), self.views[order.row]
-        camera, target = pictures.camera(view), self._resident.load(pictures, view)
-        instant = model.instant(view.time, camera, order.jitter)
+        recorded, target = pictures.camera(view), self._resident.load(pictures, view)
+        instant, camera = model.instant_of_view(view.time, recorded, order.jitter)
         weights = [term.weight(phase.progress) for term in self.terms]
         times = order.other_times or [None] * len(self.terms)
         others = [
@@ -112,8 +112,9 @@ class TrainingRenderer:
         ]
         wanted = [instant, *(other for other in others if other is not None)]
         moments = dict(zip(wanted, self._moved(model, wanted, phase), strict=True))
+        traced = model.trace(moments[instant], instant)  # terms say nothing of where views are from
         found, frame = draw_and_compare(
-            self.engine, model, moments[instant], instant, camera, self.background, target,
+            self.engine, model, traced, instant, camera, self.background, target,
             self._ssim_weight(phase.progress), self._sh_degree(phase.progress),
             self._on_device(order.tile_weights), pictures.signal(view, MASK),
             any(term.needs_depth for term in self.terms),
@@ -124,8 +125,9 @@ class TrainingRenderer:
                 then = None if other is None else moments[other]
                 moment = moments[instant]
                 seen = Seen(
-                    view, pictures, camera, target, frame, instant, moment, other, then, order.seed
-                )
+                    view, pictures, camera, target, frame, instant, moment, other, then, order.seed,
+                    model.placed,
+                )  # fmt: skip
                 loss = loss + weight * term(seen)
         return ViewGradients(
             loss.detach(), gradients_of(loss, model), found.on_screen,
@@ -143,6 +145,11 @@ class TrainingRenderer:
         if not any(term.needs_seed for term in self.terms):
             return 0
         return int(torch.randint(2**62, (), generator=generator))
+
+    def _seen(self, model: Model, instants: Sequence[Instant], phase: Phase) -> list[Moment]:
+        """Return the model at each of the instants, as it is drawn."""
+        moved = self._moved(model, instants, phase)
+        return [model.trace(moment, now) for moment, now in zip(moved, instants, strict=True)]
 
     def _moved(self, model: Model, instants: Sequence[Instant], phase: Phase) -> list[Moment]:
         """Return the model at each of the instants, the very same where these are equal."""

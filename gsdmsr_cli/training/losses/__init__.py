@@ -9,7 +9,7 @@ settings, and ``start(options) -> Term``. Terms never import one another.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
@@ -29,6 +29,10 @@ from gsdmsr_cli.scene.scene import View
 KIND = "term of the loss"
 
 
+def _as_recorded(camera: Camera, time: float) -> Camera:
+    return camera
+
+
 @dataclass(frozen=True, eq=False)
 class Seen:
     """What a term is given of one view.
@@ -43,6 +47,7 @@ class Seen:
         other_instant, other: the second instant that the term has chosen, and what the model is
             then; None unless it has an ``other_time``.
         seed: of random choices, other for every view and step; 0 unless a term ``needs_seed``.
+        place: returns the camera that a view is drawn by, given the scene's and the time.
     """
 
     view: View
@@ -55,6 +60,11 @@ class Seen:
     other_instant: Instant | None = None
     other: Moment | None = None
     seed: int = 0
+    place: Callable[[Camera, float], Camera] = _as_recorded
+
+    def camera_of(self, view: View) -> Camera:
+        """Return the camera that a view is drawn by, in the size that is drawn."""
+        return self.place(self.pictures.camera(view), view.time)
 
 
 class Term(ABC):

@@ -96,7 +96,7 @@ class Flow(Term):
             return seen.frame.rgb.new_zeros(())
         found = self._pictured.between(seen.pictures, seen.view, other)
         true = torch.from_numpy(found).to(seen.frame.rgb.device)
-        moved = screen_motion(seen.moment, seen.camera, seen.other, seen.pictures.camera(other))
+        moved = screen_motion(seen.moment, seen.camera, seen.other, seen.camera_of(other))
         drawn = blend_motion(moved, seen.moment.detach(), seen.camera, self._engine)
         counts = true.isfinite().all(dim=2) & (seen.frame.alpha.detach() >= LEAST_COVER)
         mask = seen.pictures.signal(seen.view, MASK)
