@@ -1,0 +1,191 @@
+"""Cameras that are refined in training: a small rigid correction of each picture's camera.
+
+A camera is turned about its own place by the rotation vector w and shifted by t, both in world
+axes: x_camera = R exp(-[w]) (x - c - t) where the scene has R (x - c). That is what turning and
+shifting all splats the other way does to the picture, so the gradients by w and t follow from those
+by the splats (``gaussians.torque``), exactly, whatever the engine.
+
+What all cameras could do together is left to the splats: the mean of the corrections is taken away,
+and so is the part of the shifts that scales the path about its middle.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.autograd import Function
+from torch.autograd.function import once_differentiable
+
+from gsdmsr_cli.gaussians.moment import Moment
+from gsdmsr_cli.gaussians.splats import Splats
+from gsdmsr_cli.gaussians.torque import torque
+from gsdmsr_cli.model.layer import Facts, Instant
+from gsdmsr_cli.model.layers._views import PerView
+from gsdmsr_cli.model.view_rows import Per
+from gsdmsr_cli.options.strict import require, require_rates
+from gsdmsr_cli.scene.camera import Camera
+
+Vector = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Options:
+    """Settings.
+
+    Attributes:
+        per: what has a correction: each "frame", each fixed "camera", or "auto": cameras where a
+            rig has at least two fixed ones with two pictures or more each, else frames.
+        rate: learning rate of turns [rad] and shifts [scene bounds] at the start and the end.
+        weight: of the mean over the corrections of their squared numbers, which holds them to 0.
+        since: progress from which they are learnt, once the static phase is over.
+    """
+
+    per: Per = "auto"
+    rate: tuple[float, float] = (1e-4, 1e-5)
+    weight: float = 0.1
+    since: float = 0.05
+
+    def __post_init__(self) -> None:
+        require(self, "weight", self.weight >= 0, "0 or more")
+        require(self, "since", 0 <= self.since <= 1, "a progress from 0 to 1")
+        require_rates(self, "rate")
+
+
+class Cameras(PerView):
+    """Rows (6,): a rotation vector [rad] and a shift [scene bounds], in world axes.
+
+    Errors of single poses differ from one picture to the next, so those of a view that was not
+    trained on are taken from several neighbours, of which they are the smooth part.
+    """
+
+    beside = 6
+
+    def place(self, camera: Camera, time: float) -> Camera:
+        """Return the camera with its correction, the very same where there is none."""
+        own = self.weighed(self.corrections(), camera, time)
+        return camera if own is None else corrected(camera, own.numpy())
+
+    @torch.no_grad()
+    def corrections(self) -> Tensor:
+        """Return the corrections as they are applied, (rows, 6) float64 [rad, world units]."""
+        values = self.values.detach().cpu().double()
+        values = values - values.mean(dim=0)
+        centres = torch.from_numpy(self.rows.centres())
+        arms = centres - centres.mean(dim=0)
+        turns, shifts = values[:, :3], self.bound * values[:, 3:]
+        squares = arms.square().sum()
+        if squares > 0:
+            shifts = shifts - (shifts * arms).sum() / squares * arms
+        return torch.cat([turns, shifts], dim=1)
+
+    def trace(self, moment: Moment, instant: Instant) -> Moment:
+        """Return the moment, whose gradients reach the correction of the view as well."""
+        if not self.learning or not torch.is_grad_enabled() or instant.view is None:
+            return moment
+        own = self.weighed(self.values, instant.view, instant.time)
+        if own is None:
+            return moment
+        applied = self.weighed(self.corrections(), instant.view, instant.time)
+        assert applied is not None
+        shift = torch.from_numpy(instant.view.centre) + applied[3:]
+        splats = moment.splats
+        means, quats, sh, axes = _Seen.apply(
+            own, applied[:3], shift, self.bound, splats.means, splats.quats, splats.sh, moment.axes
+        )
+        return replace(moment, splats=replace(splats, means=means, quats=quats, sh=sh), axes=axes)
+
+    def tell_views(self, views: Sequence[tuple[Camera, float]]) -> dict[str, Any]:
+        """Return how views are drawn, of which kinds how many there are."""
+        about = (
+            "cameras with a correction learnt from the train pictures; other views have the smooth "
+            "part of those of train views beside them on their path, or none"
+        )
+        return {"about": about, **super().tell_views(views)}
+
+    def check(self) -> None:
+        """Raise ValueError unless there is a correction for every view."""
+        if self.values.shape[1:] != (6,):
+            raise ValueError(f"corrections of cameras of shape {tuple(self.values.shape)}")
+        super().check()
+
+
+class _Seen(Function):
+    """Splats as they are; backward, what their gradients say of a camera's turn and shift."""
+
+    @staticmethod
+    def forward(
+        ctx: Any,
+        own: Tensor,  # (6,), which gets the gradient
+        turn: Tensor,  # (3,) as it is applied [rad]
+        centre: Tensor,  # (3,) of the camera as it is applied [world units]
+        bound: float,
+        means: Tensor,
+        quats: Tensor,
+        sh: Tensor,
+        axes: Tensor | None,
+    ) -> tuple[Tensor | None, ...]:
+        ctx.save_for_backward(means, quats, sh, axes)
+        ctx.turn, ctx.centre, ctx.bound, ctx.own = turn, centre, bound, own.detach()
+        ctx.set_materialize_grads(False)
+        seen = (means.view_as(means), quats.view_as(quats), sh.view_as(sh))
+        return *seen, None if axes is None else axes.view_as(axes)
+
+    @staticmethod
+    @once_differentiable  # type: ignore[untyped-decorator]
+    def backward(
+        ctx: Any,
+        d_means: Tensor | None,
+        d_quats: Tensor | None,
+        d_sh: Tensor | None,
+        d_axes: Tensor | None,
+    ) -> tuple[Tensor | float | None, ...]:
+        means, quats, sh, axes = ctx.saved_tensors
+        given = means, quats, axes, sh, d_means, d_quats, d_axes, d_sh
+        turned = torque(*given, ctx.centre).cpu()
+        shifted = turned.new_zeros(3)
+        if d_means is not None:
+            shifted = d_means.sum(dim=0, dtype=torch.float64).cpu()
+        # a turn by w + d is one by w, then one by J d (``left_jacobian``), here of the world back
+        d_turn = -left_jacobian(ctx.turn).mT @ turned
+        found = torch.cat([d_turn, -ctx.bound * shifted]).to(ctx.own)
+        return found, None, None, None, d_means, d_quats, d_sh, d_axes
+
+
+def corrected(camera: Camera, correction: Vector) -> Camera:
+    """Return a camera turned about its place and shifted, by (6,) [rad, world units]."""
+    turn = torch.linalg.matrix_exp(_cross(torch.from_numpy(correction[:3]))).numpy()
+    pose = np.eye(4)
+    pose[:3, :3] = camera.rotation @ turn.T
+    pose[:3, 3] = -pose[:3, :3] @ (camera.centre + correction[3:])
+    return replace(camera, world_to_camera=pose)
+
+
+def left_jacobian(turn: Tensor) -> Tensor:
+    """Return J (3, 3) with exp([w + d]) = exp([J d]) exp([w]) to first order, of w (3,) [rad].
+
+    The series of Barfoot, State Estimation for Robotics (2017), (7.77), up to the fourth power.
+    """
+    cross = _cross(turn)
+    total = term = torch.eye(3, dtype=turn.dtype)
+    for power in range(2, 6):
+        term = term @ cross / power
+        total = total + term
+    return total
+
+
+def _cross(vector: Tensor) -> Tensor:
+    """Return the matrix (3, 3) of the vector product with (3,) from the left."""
+    x, y, z = vector.tolist()
+    return vector.new_tensor([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+
+
+def start(options: Options, facts: Facts, splats: Splats, generator: torch.Generator) -> Cameras:
+    """Return corrections that change nothing until they have been trained."""
+    o = options
+    return Cameras(o.per, (6,), o.rate, o.weight, o.since, facts.bound)
