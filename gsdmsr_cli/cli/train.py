@@ -12,6 +12,9 @@ import typer
 from gsdmsr_cli.cli.options import Background, VerifyData, preset_names
 from gsdmsr_cli.ground.errors import UsageError
 
+_STREAMED = "persistent"
+"""The preset that --stream takes where none is named."""
+
 
 def register(app: typer.Typer) -> None:
     """Add the command."""
@@ -53,6 +56,9 @@ def train(
     keep: Annotated[
         int | None, typer.Option(metavar="N", help="How many of the last checkpoints to keep.")
     ] = None,
+    stream: Annotated[
+        bool, typer.Option("--stream", help="Train one moment after the other; see stream.md.")
+    ] = False,
     resume: Annotated[
         bool, typer.Option("--resume", help="Go on from RUN's last checkpoint.")
     ] = False,
@@ -88,7 +94,10 @@ def train(
         "training.seed": seed,
         "training.threads": threads,
         "training.keep": keep,
+        "stream.enabled": stream or None,
     }
+    if stream and not resume:
+        preset = preset or _STREAMED
     overrides = *(set_ or ()), *_overrides(options)
     named = data, out, preset, config, overrides, device
     request = Request(*named, resume, overwrite, dry_run, verify_data, tensorboard, wandb)

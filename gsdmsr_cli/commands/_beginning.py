@@ -15,6 +15,7 @@ from gsdmsr_cli.ground.errors import UsageError
 from gsdmsr_cli.ground.locks import sole_writer
 from gsdmsr_cli.options import strict
 from gsdmsr_cli.options.preset import Preset, TrainingOptions, load_preset
+from gsdmsr_cli.runs import moments
 from gsdmsr_cli.runs.checkpoints import Checkpoint
 from gsdmsr_cli.runs.outputs import OUTPUTS
 from gsdmsr_cli.runs.run import Run, continue_run, create_run, is_run, open_run, refuse_used
@@ -22,11 +23,12 @@ from gsdmsr_cli.runs.seen_pictures import check_whole
 from gsdmsr_cli.scene.scene import Scene
 from gsdmsr_cli.training.request import Request
 from gsdmsr_cli.training.schedule import new_clock
+from gsdmsr_cli.training.streaming.trainer import StreamTrainer
 from gsdmsr_cli.training.trainer import Trainer
 
 MAY_CHANGE = (
     "training.budget", "training.steps", "training.threads", "training.checkpoint_minutes",
-    "training.keep", "data.cache_mib",
+    "training.keep", "data.cache_mib", "stream.budget", "stream.steps",
 )  # fmt: skip
 """Options that a resumed training may have otherwise: its length, and what changes no result."""
 
@@ -136,6 +138,8 @@ class Resumed:
         """
         folder = continue_run(self._earlier, self.options, trainer.scene)
         folder.rewind_log(trainer.clock.step)
+        if isinstance(trainer, StreamTrainer):
+            moments.rewind(folder.root, trainer.clock.moment)
         return folder
 
 
@@ -165,6 +169,8 @@ def after_restart(request: Request, job: str) -> Request | None:
 
 def is_complete(run: Run, checkpoint: Checkpoint, length: TrainingOptions) -> bool:
     """Return whether a training has ended; one that was killed as it did has not."""
+    if run.preset.stream.enabled:
+        return checkpoint.progress >= 1 and bool(run.account(checkpoint.step))
     clock = new_clock(length)
     clock.step, clock.before = checkpoint.step, checkpoint.elapsed
     return clock.progress >= 1 and bool(run.account(clock.step))

@@ -9,6 +9,7 @@ from gsdmsr_cli.commands._found import Found
 from gsdmsr_cli.evaluation import protocol
 from gsdmsr_cli.formats import needs_preparing, read_scene
 from gsdmsr_cli.ground.errors import DataError
+from gsdmsr_cli.runs import moments
 from gsdmsr_cli.runs.outputs import EVALUATION, METRICS
 from gsdmsr_cli.runs.run import Run, open_run
 
@@ -53,11 +54,19 @@ def _trained(run: Run) -> dict[str, Any]:
         "trained_s": round(checkpoint.elapsed, 1),
         "splats": len(model.splats),
         "moving": model.moving,
+        **_moments(run),
         **psnr,
         "checkpoint_bytes": run.checkpoint_path.stat().st_size,
         **protocol.storage(checkpoint.sizes()),
         "evaluated": (run.results / EVALUATION / METRICS).is_file(),
     }
+
+
+def _moments(run: Run) -> dict[str, Any]:
+    """Return how many moments of a stream are there; nothing of another run."""
+    if not run.preset.stream.enabled or run.is_file:
+        return {}
+    return {"moments": f"{len(moments.there(run.root))} of {run.facts.frames}"}
 
 
 def _data(run: Run) -> dict[str, Any]:

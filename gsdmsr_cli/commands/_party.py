@@ -69,6 +69,8 @@ def require_suited(party: Party, options: Preset, device: str) -> None:
             f"{size} ranks train on CPUs alone: sums of a GPU differ from rank to rank; give "
             "--device cpu"
         )
+    if size > 1 and options.stream.enabled:
+        raise UsageError(f"{size} ranks cannot share a stream: train it in one process")
     if size > views:
         raise UsageError(
             f"{size} ranks share the views of a step, and training.views_per_step is {views}; "

@@ -12,6 +12,7 @@ from gsdmsr_cli.backends.cpu.jit import threads
 from gsdmsr_cli.commands._info_scene import facts_of
 from gsdmsr_cli.commands.presets import describe_options
 from gsdmsr_cli.ground import say
+from gsdmsr_cli.options.preset import Preset
 from gsdmsr_cli.training.gradients.workers import processes_for
 from gsdmsr_cli.training.memory import estimate
 from gsdmsr_cli.training.trainer import Trainer
@@ -29,6 +30,7 @@ def say_plan(trainer: Trainer, name: str, reason: str | None, device: str) -> No
         "preset": name,
         "reason": reason,
         "length": options.training.budget or f"{options.training.steps} steps",
+        **_stream(options, trainer),
         "begins_at_step": trainer.clock.step,
         "splats": len(trainer.model.splats),
         "splats_at_most": options.density.cap,
@@ -40,6 +42,14 @@ def say_plan(trainer: Trainer, name: str, reason: str | None, device: str) -> No
     }
     document = {"dry_run": True, **plan, "options": changed, "scene": facts_of(trainer.scene)}
     say.result(document, _table(plan), _options(changed), "nothing has been written")
+
+
+def _stream(options: Preset, trainer: Trainer) -> dict[str, Any]:
+    """Return how many moments are trained one after the other, and how long all but the first."""
+    if not options.stream.enabled:
+        return {}
+    each = options.stream.budget or f"{options.stream.steps} steps"
+    return {"moments": len(trainer.scene.train_times), "each_moment": each}
 
 
 def _table(plan: dict[str, Any]) -> Table:

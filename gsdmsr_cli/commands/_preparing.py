@@ -23,6 +23,8 @@ from gsdmsr_cli.training.gradients.workers import processes_for
 from gsdmsr_cli.training.masks import check_masks
 from gsdmsr_cli.training.ranks.alone import most_of
 from gsdmsr_cli.training.request import Request
+from gsdmsr_cli.training.streaming.shots import first_shot
+from gsdmsr_cli.training.streaming.trainer import StreamTrainer
 from gsdmsr_cli.training.trainer import Trainer
 from gsdmsr_cli.training.warm_up import warm_up, warm_up_motion
 
@@ -53,11 +55,13 @@ def prepare(scene: Scene, options: Preset, party: Party, device: str) -> Trainer
     pictures = Pictures(
         BACKGROUNDS[options.data.background], options.data.downscale, options.data.cache_mib << 20
     )
-    _preload(pictures, scene)
+    streams = options.stream.enabled
+    _preload(pictures, first_shot(scene) if streams else scene)
     doubt = check_masks(pictures, scene.split("train"))
     if doubt is not None:
         say.warn(doubt)
-    return Trainer(scene, options, raster.best_engine(device), pictures, device, party.ranks)
+    kind = StreamTrainer if streams else Trainer
+    return kind(scene, options, raster.best_engine(device), pictures, device, party.ranks)
 
 
 def start_work(trainer: Trainer, device: str) -> float:

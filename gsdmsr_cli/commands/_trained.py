@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
@@ -12,10 +12,12 @@ import torch
 from gsdmsr_cli import raster
 from gsdmsr_cli.evaluation.protocol import ViewRenderer
 from gsdmsr_cli.formats import read_scene
+from gsdmsr_cli.ground import say
 from gsdmsr_cli.ground.errors import DataError
 from gsdmsr_cli.ground.locks import one_of_readers
 from gsdmsr_cli.model.model import Model
 from gsdmsr_cli.options.preset import BACKGROUNDS
+from gsdmsr_cli.runs import moments
 from gsdmsr_cli.runs.checkpoints import Checkpoint
 from gsdmsr_cli.runs.run import Run, open_with_model
 from gsdmsr_cli.runs.seen_pictures import check_whole
@@ -70,7 +72,19 @@ def open_trained(
         if verify:
             check_whole(run.root, scene)
         renderer, device = _renderer(run, model, background, downscale)
-        yield Trained(run, checkpoint, scene, renderer, device)
+        yield Trained(run, checkpoint, _so_far(run, scene), renderer, device)
+
+
+def _so_far(run: Run, scene: Scene) -> Scene:
+    """Return a scene without what is later than the last moment of a stream that goes on."""
+    if not run.has_moments:
+        return scene
+    count, times = len(moments.there(run.root)), scene.train_times
+    if count == len(times):
+        return scene
+    last = float(moments.read(run.root, moments.there(run.root)[-1]).about["time"])
+    say.note(f"{count} of {len(times)} moments are there; views of later times are left out")
+    return replace(scene, views=tuple(view for view in scene.views if view.time <= last))
 
 
 def _renderer(

@@ -46,7 +46,7 @@ class TrainingDisplay:
         """Show a report; one in twenty or so becomes a line, of the log if there is a terminal."""
         if self._live is not None:
             self._live.update(self._task, completed=report.progress, description=describe(report))
-        if report.progress >= min(self._next_line, 1.0):
+        if report.always_told or report.progress >= min(self._next_line, 1.0):
             self._next_line = report.progress + LINE_EVERY
             tell = say.note if self._live is None else say.write_log
             tell(describe(report))
@@ -58,7 +58,7 @@ def describe(report: Report) -> str:
     left = _duration(report.remaining)
     dropped = f" ({report.dropped} dropped)" if report.dropped else ""
     return (
-        f"{report.progress:4.0%}  step {report.step}  {report.split} PSNR {psnr}  "
+        f"{report.progress:4.0%}  {report.place}step {report.step}  {report.split} PSNR {psnr}  "
         f"{report.splats} splats{dropped}  {report.ms_per_step:.1f} ms/step  {left} left"
     )
 

@@ -40,7 +40,9 @@ def viewed(folder: Run, trainer: Trainer, port: int | None) -> Iterator[Callable
         model = _copy_of(trainer)
         return quick_file(model, *facts, {"scene": scene_facts(folder, model, trainer.scene)})
 
-    snapshots = None if trainer.model.needs_camera else Snapshots(folder.root, make)
+    # a stream's page shows the moments that are over, from their files
+    shown = not (trainer.model.needs_camera or trainer.preset.stream.enabled)
+    snapshots = Snapshots(folder.root, make) if shown else None
 
     def offer(_report: Report) -> None:
         nonlocal snapshots

@@ -30,6 +30,9 @@ from gsdmsr_cli.runs.run import Run, require_apart
 from gsdmsr_cli.scene.scene import Scene
 from gsdmsr_cli.training.loop import Report, train
 from gsdmsr_cli.training.request import Request
+from gsdmsr_cli.training.streaming.loop import stream
+from gsdmsr_cli.training.streaming.shots import check_scene
+from gsdmsr_cli.training.streaming.trainer import StreamTrainer
 from gsdmsr_cli.training.trainer import Trainer
 
 
@@ -111,6 +114,9 @@ def _begin(request: Request, party: Party, held: ExitStack) -> _Begun:
     scene, load_s = timed(lambda: read(request))
     beginning.suit(scene)
     require_suited(party, beginning.options, device)
+    if beginning.options.stream.enabled:
+        for text in check_scene(scene):
+            say.warn(text)
     return _Begun(there, beginning, device, scene, load_s)
 
 
@@ -143,7 +149,11 @@ def _train(
             observing(observers, folder, began) as hand_on,
             viewed(folder, trainer, request.view_port) as offer,
         ):
-            finished = train(trainer, folder, _all(display.show, hand_on, offer), say.warn)
+            given = folder, _all(display.show, hand_on, offer), say.warn
+            if isinstance(trainer, StreamTrainer):
+                finished = stream(trainer, *given)
+            else:
+                finished = train(trainer, *given)
     with party.all_or_none():
         account = _write_account(folder, trainer, begun.device, timings, processes)
     _say_end(folder, trainer, request.data, finished)
@@ -182,7 +192,7 @@ def _write_account(
         **{name: round(seconds, 3) for name, seconds in timings.items()},
         "train_s": round(clock.elapsed, 3),
         "steps": clock.step,
-        "progress": clock.progress,
+        "progress": clock.overall,
         "splats": len(trainer.model.splats),
         "peak_rss_mib": machine.peak_rss_mib(processes - 1),
         "device": device,

@@ -5,6 +5,7 @@
     RUN/metrics.jsonl     one line per report of the training
     RUN/checkpoint.safetensors   the last checkpoint, with its state as JSON in the header
     RUN/checkpoints/             earlier ones, if any are kept: step-001200.safetensors
+    RUN/moments/                 of a stream: a file for each moment, see ``runs.moments``
     RUN/training.json     how long the training took, on which machine
     RUN/torchrun.json     which call of torchrun has begun or resumed it, if one has
 
@@ -39,7 +40,7 @@ from gsdmsr_cli.model.model import Model
 from gsdmsr_cli.options import strict
 from gsdmsr_cli.options.preset import Preset
 from gsdmsr_cli.options.renamed import with_present_names
-from gsdmsr_cli.runs import checkpoints, earlier, log, moving_file, seen_pictures
+from gsdmsr_cli.runs import checkpoints, earlier, log, moments, moving_file, seen_pictures, stream
 from gsdmsr_cli.runs.checkpoints import LAST, SCHEMA, WRONG, Checkpoint
 from gsdmsr_cli.scene.picture_hashes import digest
 from gsdmsr_cli.scene.scene import Scene
@@ -94,6 +95,11 @@ class Run:
     def checkpoint_path(self) -> Path:
         """The last checkpoint."""
         return self.root if self.is_file else self.root / LAST
+
+    @property
+    def has_moments(self) -> bool:
+        """Whether it is a stream that has come past its first moment's end."""
+        return self.preset.stream.enabled and bool(moments.there(self.root))
 
     @property
     def training_path(self) -> Path:
@@ -269,14 +275,14 @@ class Run:
             raise DataError(f"{path}: damaged checkpoint: {error}; {remedy}") from error
 
     def load_model(self) -> tuple[Model, Checkpoint]:
-        """Read the model of the last checkpoint, for drawing.
+        """Read the model of the last checkpoint, for drawing; of a stream, all moments so far.
 
         Raises:
             DataError: there is none, or it is not what the run's description says.
         """
         if self.is_file:
             return moving_file.load(self.root)
-        checkpoint = self.load()
+        checkpoint = stream.load(self.root) if self.has_moments else self.load()
         preset, progress = self.preset, checkpoint.progress
         given = preset.motion, preset.layers, self.facts, progress, preset.training.precision
         try:
@@ -424,6 +430,7 @@ def _clear(root: Path) -> None:
     Its description stays until it is replaced: a folder without one would be nobody's.
     """
     remove_leftovers(root)
+    moments.rewind(root, 0)
     checkpoints.remove(root)
     for name in (_LOG, _TRAINING, _JOB, seen_pictures.PICTURES):
         (root / name).unlink(missing_ok=True)

@@ -43,8 +43,8 @@ class Report:
         still: share of them that stand still.
         dropped: splats dropped since the training began, because values were not finite.
         ms_per_step: mean wall time since the last report [ms].
-        psnr: of the validation view, rounded to 8 bits [dB], or None if it is not a number.
-        split: which split the validation view belongs to, "val" or, in scenes without, "train".
+        psnr: of the watched view, rounded to 8 bits [dB], or None if it is not a number.
+        split: which split that view belongs to, "val" or, in scenes without, "train".
         timings: seconds since the last report by what they went into, see ``TIMINGS``.
     """
 
@@ -65,6 +65,16 @@ class Report:
     def remaining(self) -> float:
         """Wall time that is left at the pace so far [s]."""
         return self.elapsed * (1 - self.progress) / max(self.progress, 1e-9)
+
+    @property
+    def place(self) -> str:
+        """Where in the training it is, beside step and progress; empty where there is no more."""
+        return ""
+
+    @property
+    def always_told(self) -> bool:
+        """Whether it is a line of its own even where there are only lines now and then."""
+        return False
 
     def entry(self) -> dict[str, Any]:
         """Return the report as a line of the log."""
@@ -99,10 +109,33 @@ def train(
         GsdmsrError: the training has diverged; the last checkpoint is kept.
         DataError: a picture cannot be read, or the last checkpoint not be written.
     """
-    keeper = Keeper(trainer, run, on_warning)
-    with _ctrl_c(trainer.ranks.size > 1) as wanted:
+
+    def work(keeper: Keeper, wanted: threading.Event) -> None:
+        interval = Interval(trainer, validation_view(trainer.scene), REPORT_EVERY_PROGRESS)
+        trainer.clock.start()
+        make_steps(interval, keeper, on_report, wanted)
+        if interval.losses:
+            tell(interval.report(), keeper, on_report)
+
+    return kept_while(work, Keeper(trainer, run, on_warning), trainer.ranks.size > 1)
+
+
+def kept_while(
+    work: Callable[[Keeper, threading.Event], None], keeper: Keeper, patient: bool = False
+) -> bool:
+    """Work with Ctrl-C as an event, and save at the end, whatever that is; return if it was whole.
+
+    Args:
+        work: is told when the end is wanted.
+        keeper: saves.
+        patient: whether a second Ctrl-C waits as well.
+
+    Raises:
+        GsdmsrError, DataError: see ``train``.
+    """
+    with _ctrl_c(patient) as wanted:
         try:
-            _make_steps(trainer, keeper, on_report, wanted)
+            work(keeper, wanted)
         except KeyboardInterrupt:  # the second Ctrl-C, which does not wait
             raise
         except BaseException:
@@ -112,34 +145,31 @@ def train(
     return not wanted.is_set()
 
 
-def _make_steps(
-    trainer: Trainer,
+def tell(report: Report, keeper: Keeper, on_report: Callable[[Report], None]) -> None:
+    """Log a report, and hand it on."""
+    keeper.log(report.entry())
+    on_report(report)
+
+
+def make_steps(
+    interval: Interval,
     keeper: Keeper,
     on_report: Callable[[Report], None],
     wanted: threading.Event,
 ) -> None:
-    """Make steps until the clock has run out or the end is wanted."""
-
-    def tell() -> None:
-        report = interval.report()
-        keeper.log(report.entry())
-        on_report(report)
-
-    interval = _Interval(trainer, validation_view(trainer.scene))
+    """Make steps until the clock has run out or the end is wanted, with reports and checkpoints."""
+    trainer = interval.trainer
     save_every = 60 * trainer.preset.training.checkpoint_minutes
-    trainer.clock.start()
     interval.begin()
     saved = time.perf_counter()
     while _goes_on(trainer, wanted):
         interval.count(trainer.step().loss)
         if interval.is_due():
-            tell()
+            tell(interval.report(), keeper, on_report)
         if time.perf_counter() - saved >= save_every:
             with trainer.stopwatch.of("save"):
                 keeper.save()
             saved = time.perf_counter()
-    if interval.losses:
-        tell()
 
 
 def follow(trainer: Trainer) -> bool:
@@ -170,11 +200,20 @@ def validation_view(scene: Scene) -> View:
 
 
 @dataclass
-class _Interval:
-    """The steps since the last report."""
+class Interval:
+    """The steps since the last report.
+
+    Attributes:
+        trainer: that makes them.
+        view: whose PSNR is told.
+        every: progress after which a report is due, if it is not for the time.
+        losses: of the steps.
+        elapsed, progress: of the clock as the interval began.
+    """
 
     trainer: Trainer
     view: View
+    every: float
     losses: list[Tensor] = field(default_factory=list)
     elapsed: float = 0.0
     progress: float = 0.0
@@ -193,7 +232,7 @@ class _Interval:
         clock = self.trainer.clock
         return (
             clock.elapsed - self.elapsed >= REPORT_EVERY
-            or clock.progress - self.progress >= REPORT_EVERY_PROGRESS
+            or clock.progress - self.progress >= self.every
         )
 
     def report(self) -> Report:
@@ -211,7 +250,7 @@ class _Interval:
         report = Report(
             step=clock.step,
             elapsed=clock.elapsed,
-            progress=clock.progress,
+            progress=clock.overall,
             loss=sum(finite) / len(finite) if finite else None,
             splats=len(model.splats),
             salient=_share(self.trainer.saliency.high),

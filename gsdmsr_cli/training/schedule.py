@@ -58,6 +58,11 @@ class Clock:
             return min(self.elapsed / self.budget, 1.0)
         return min(self.step / self.steps, 1.0)
 
+    @property
+    def overall(self) -> float:
+        """How far all of it is, in [0, 1]: the same, unless there are several trainings in turn."""
+        return self.progress
+
 
 def new_clock(options: TrainingOptions) -> Clock:
     """Return the clock of a training that has not begun."""

@@ -64,7 +64,7 @@ def take(training: Training) -> Checkpoint:
         "averaged": average.count,
     }
     clock = training.clock
-    return Checkpoint(clock.step, clock.progress, clock.elapsed, tensors, state)
+    return Checkpoint(clock.step, clock.overall, clock.elapsed, tensors, state)
 
 
 def restore(training: Training, checkpoint: Checkpoint) -> None:

@@ -36,6 +36,7 @@ from gsdmsr_cli.training.resizing import Population
 from gsdmsr_cli.training.saliency import Saliency
 from gsdmsr_cli.training.schedule import new_clock
 from gsdmsr_cli.training.starting.initial import facts_of, initial_splats
+from gsdmsr_cli.training.streaming.shots import check_options
 from gsdmsr_cli.training.timings import Stopwatch
 from gsdmsr_cli.training.window import start_window
 
@@ -90,7 +91,12 @@ class Trainer:
         self.generator = torch.Generator().manual_seed(preset.training.seed)
         background = torch.tensor(BACKGROUNDS[preset.data.background])
         splats, times = initial_splats(
-            scene, preset.splats, pictures, background, self.generator, preset.density.cap
+            self._beginning(),
+            preset.splats,
+            pictures,
+            background,
+            self.generator,
+            preset.density.cap,
         )
         self.facts = facts_of(scene, splats)
         model = start_model(
@@ -124,6 +130,14 @@ class Trainer:
     def model(self) -> Model:
         """What is trained."""
         return self.population.model
+
+    def _beginning(self) -> Scene:
+        """Return the scene in whose views the initial splats are looked for."""
+        return self.scene
+
+    def _learning(self) -> dict[str, Tensor]:
+        """Return the tensors that the optimiser moves, by name."""
+        return self.model.trained()
 
     def __enter__(self) -> Trainer:
         return self
@@ -300,7 +314,7 @@ class Trainer:
         rest = self.model.splats.sh.detach()[:, 1:]
         before = None if share == 1 else rest.clone()
         with self.workers.all_threads():
-            self.optimizer.step(self.model.trained(), rates, gates, loss)
+            self.optimizer.step(self._learning(), rates, gates, loss)
         if before is not None:
             rest.copy_(torch.lerp(before, rest, share))
         if gated is not None:
@@ -377,6 +391,7 @@ def check_plugins(preset: Preset) -> None:
     Their options are checked as well; no data is needed.
     """
     check_layers(preset.motion, preset.layers)
+    check_options(preset)
     start_events(preset)
     for settings in preset.losses.terms:
         start_term(settings)

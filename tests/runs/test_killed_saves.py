@@ -5,15 +5,13 @@ from __future__ import annotations
 import os
 import shutil
 import signal
-import sys
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from kills_in_place import at_byte, kill_everywhere, killed
 
 from gsdmsr_cli.ground.errors import DataError
 from gsdmsr_cli.model.layer import Facts
@@ -26,9 +24,6 @@ from gsdmsr_cli.scene.scene import Scene
 pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="processes cannot be forked here")
 
 FACTS = Facts(bound=1.3, box=((-1.0, -1.1, -1.2), (1.3, 1.2, 1.1)), frames=12)
-CALLS = "open", "os.rename", "os.remove", "os.mkdir", "os.rmdir", "os.link", "os.chmod"
-"""What Python tells of before it is done."""
-
 BEFORE, AFTER = 7, 8
 """Steps of the checkpoint that is there, and of the one that is being written."""
 
@@ -56,51 +51,6 @@ def checkpoint_of(step: int) -> Checkpoint:
     return Checkpoint(step, 0.5, 1.0, {"values": torch.randn(500, generator=rng)}, {"at": step})
 
 
-def killed(work: Callable[[], object], arrange: Callable[[], object]) -> bool:
-    """Do work in a fork that has arranged its end; return whether it was killed in it."""
-    pid = os.fork()
-    if not pid:
-        try:
-            arrange()
-            work()
-        finally:
-            os._exit(0)
-    return os.WIFSIGNALED(os.waitpid(pid, 0)[1])
-
-
-def at_call(number: int, root: Path) -> Callable[[], None]:
-    """Return what lets a process be killed before its call of this number for the folder."""
-    left = [number]
-
-    def count() -> None:
-        left[0] -= 1
-        if left[0] < 0:
-            os.kill(os.getpid(), signal.SIGKILL)
-
-    def watch(event: str, arguments: tuple[Any, ...]) -> None:
-        if event in CALLS and str(root) in str(arguments[0]):
-            count()
-
-    def arrange() -> None:
-        fsync = os.fsync
-        os.fsync = lambda descriptor: (count(), fsync(descriptor))  # type: ignore[assignment]
-        sys.addaudithook(watch)
-
-    return arrange
-
-
-def at_byte(number: int, fatal: bool) -> Callable[[], None]:
-    """Return what lets no file grow beyond so many bytes: the process is killed, or told."""
-
-    def arrange() -> None:
-        import resource
-
-        signal.signal(signal.SIGXFSZ, signal.SIG_DFL if fatal else signal.SIG_IGN)
-        resource.setrlimit(resource.RLIMIT_FSIZE, (number, number))
-
-    return arrange
-
-
 def assert_sound(run: Run, steps: set[int], scene: Scene) -> None:
     """Hold a run to what the next command wants of it: a whole checkpoint, and its own files."""
     opened = open_run(run.root)
@@ -119,15 +69,6 @@ def assert_sound(run: Run, steps: set[int], scene: Scene) -> None:
         path.unlink()
     for step in (BEFORE - 1, BEFORE):
         continued.save(checkpoint_of(step))
-
-
-def kill_everywhere(work: Callable[[], object], root: Path, check: Callable[[], None]) -> int:
-    """Kill the work before each of its calls, one after the other; return how many there are."""
-    number = 0
-    while killed(work, at_call(number, root)):
-        check()
-        number += 1
-    return number
 
 
 @pytest.mark.parametrize("keep", [1, 2, 3])

@@ -15,18 +15,15 @@ from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
-from torch.nn.functional import normalize
 
 from gsdmsr_cli.gaussians.moment import Moment
 from gsdmsr_cli.gaussians.splats import Splats
 from gsdmsr_cli.ground.geometry import quat_product
 from gsdmsr_cli.model.layer import Facts, Instant, Layer
+from gsdmsr_cli.model.motion._arcs import slerp
 from gsdmsr_cli.model.parameter import Parameter
 from gsdmsr_cli.ops.series import add_series
 from gsdmsr_cli.options.strict import require, require_rates
-
-LARGEST_COSINE = 1 - 1e-4
-"""Beyond it, arcs are as good as chords; the arc cosine has no slope there that could be used."""
 
 
 @dataclass(frozen=True)
@@ -111,17 +108,3 @@ def hermite(u: float) -> tuple[float, float, float, float]:
     b, d = u**3 - 2 * u**2 + u, u**3 - u**2
     c = 3 * u**2 - 2 * u**3
     return -b / 2, 1 - c - d / 2, c + b / 2, d / 2
-
-
-def slerp(first: Tensor, second: Tensor, u: float) -> Tensor:
-    """Return the rotations (N, 4) at u in [0, 1] on the shorter arcs between two.
-
-    ``first`` and ``second`` (N, 4) are what has been added to the quaternion of no rotation.
-    """
-    whole = first.new_tensor([1.0, 0.0, 0.0, 0.0])
-    a, b = normalize(whole + first, dim=1), normalize(whole + second, dim=1)
-    cosine = (a * b).sum(dim=1, keepdim=True)
-    b = torch.where(cosine < 0, -b, b)
-    angle = torch.acos(cosine.abs().clamp(max=LARGEST_COSINE))
-    between = torch.sin((1 - u) * angle) * a + torch.sin(u * angle) * b
-    return normalize(between, dim=1)

@@ -14,7 +14,8 @@ from gsdmsr_cli.gaussians.moment import Moment
 from gsdmsr_cli.ground.errors import UsageError
 from gsdmsr_cli.model import motion as motions
 from gsdmsr_cli.model.layer import Instant, Layer, options_of
-from gsdmsr_cli.model.motion.keyframes import Options, slerp
+from gsdmsr_cli.model.motion._arcs import slerp
+from gsdmsr_cli.model.motion.keyframes import Options
 
 COUNT, KEYFRAMES = 5, 4
 TIMES = (0.0, 0.2, 1 / 3, 0.5, 0.83, 1.0)

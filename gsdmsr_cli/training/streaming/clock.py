@@ -1,0 +1,68 @@
+"""Counts the steps and the time of a stream, and how far the present moment is."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from gsdmsr_cli.options.preset import Preset, parse_duration
+from gsdmsr_cli.training.schedule import Clock
+
+
+@dataclass
+class StreamClock(Clock):
+    """Steps and time go on from moment to moment, progress begins anew in each.
+
+    Attributes:
+        moments: how many there are.
+        moment: the present one, from 0.
+        first_step: steps that had been made as it began.
+        first_elapsed: wall time of training until then [s].
+    """
+
+    moments: int = 1
+    moment: int = 0
+    first_step: int = 0
+    first_elapsed: float = 0.0
+
+    @property
+    def progress(self) -> float:
+        """How far the present moment is, in [0, 1]."""
+        if self.budget is not None:
+            return min(self.spent / self.budget, 1.0)
+        return min((self.step - self.first_step) / self.steps, 1.0)
+
+    @property
+    def spent(self) -> float:
+        """Wall time of the present moment so far [s]."""
+        return self.elapsed - self.first_elapsed
+
+    @property
+    def overall(self) -> float:
+        """How far all moments are, in [0, 1]."""
+        return min((self.moment + self.progress) / self.moments, 1.0)
+
+    def begin(self, moment: int, preset: Preset) -> None:
+        """Let a moment begin now, of the length that the preset gives it."""
+        self.moment, self.first_step, self.first_elapsed = moment, self.step, self.elapsed
+        self.measure(preset)
+
+    def measure(self, preset: Preset) -> None:
+        """Take the length of the present moment from the preset."""
+        length = preset.stream if self.moment else preset.training
+        self.steps = length.steps
+        self.budget = None if length.budget is None else parse_duration(length.budget)
+
+    def state(self) -> dict[str, Any]:
+        """Return what a resumed training needs beside the steps and the time.
+
+        Where steps are counted that is the same in every training: it has no times in it.
+        """
+        timed = {} if self.budget is None else {"first_elapsed": self.first_elapsed}
+        return {"moment": self.moment, "first_step": self.first_step, **timed}
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Return to what ``state`` returned."""
+        self.moment, self.first_step = int(state["moment"]), int(state["first_step"])
+        self.first_elapsed = float(state.get("first_elapsed", self.before))

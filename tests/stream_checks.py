@@ -1,0 +1,42 @@
+"""A short stream on a small rig, for tests of its trainer, its loop and its run folder."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from gsdmsr_cli.formats import read_scene
+from gsdmsr_cli.options.preset import Preset, load_preset
+from gsdmsr_cli.raster import best_engine
+from gsdmsr_cli.scene.pictures import Pictures
+from gsdmsr_cli.training.streaming.trainer import StreamTrainer
+
+FIRST, EACH, MOMENTS = 24, 8, 4
+"""Steps of the first moment and of each later one, and how many moments there are."""
+
+OPTIONS = (
+    f"training.steps={FIRST}", f"stream.steps={EACH}", "training.average_from=0.5",
+    "splats.count=150", "splats.start=box", "stream.keyframe_every=2", "stream.samples=64",
+    "density.start=4", "density.every=4", "density.until=0.8", "density.gradient=1e-7",
+    "density.cap=220", "data.background=white", "training.low_resolution_until=0.2",
+)  # fmt: skip
+
+
+def preset_of(*options: str) -> Preset:
+    return load_preset("persistent", None, [*OPTIONS, *options])
+
+
+def stream_trainer(data: Path, *options: str) -> StreamTrainer:
+    preset = preset_of(*options)
+    pictures = Pictures((1.0, 1.0, 1.0), 1, 1 << 24)
+    return StreamTrainer(read_scene(data), preset, best_engine("cpu"), pictures)
+
+
+def through(trainer: StreamTrainer, moments: int) -> None:
+    """Train the present moment and later ones, until so many are over."""
+    while True:
+        while trainer.clock.progress < 1:
+            trainer.step()
+        trainer.settle()
+        if trainer.clock.moment == moments - 1:
+            return
+        trainer.begin_next()

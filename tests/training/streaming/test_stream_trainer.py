@@ -1,0 +1,164 @@
+"""A stream: what each moment sees and learns, and that it is the same however it is made."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from rigs import write_rig
+from stream_checks import EACH, FIRST, MOMENTS, preset_of, stream_trainer, through
+from training_checks import assert_same_tensors, copies, run_of
+
+from gsdmsr_cli.backends.cpu import jit
+from gsdmsr_cli.training.gradients.phase import Order
+from gsdmsr_cli.training.streaming import trainer as module
+from gsdmsr_cli.training.streaming.trainer import TRACKED, StreamTrainer
+
+
+@pytest.fixture(scope="module")
+def rig(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_rig(tmp_path_factory.mktemp("rig"), moments=MOMENTS)
+
+
+@pytest.fixture
+def trainer(rig: Path) -> StreamTrainer:
+    return stream_trainer(rig)
+
+
+def test_each_moment_sees_its_own_pictures_and_all_of_them_before_any_again(
+    trainer: StreamTrainer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen: list[tuple[float, str]] = []
+    order = StreamTrainer._order
+
+    def remember(self: StreamTrainer, row: int, progress: float) -> Order:
+        view = self.views[row]
+        seen.append((view.time, view.name))
+        return order(self, row, progress)
+
+    monkeypatch.setattr(StreamTrainer, "_order", remember)
+    through(trainer, MOMENTS)
+    lengths = [FIRST, *[EACH] * (MOMENTS - 1)]
+    for shot, length in zip(trainer.shots, lengths, strict=True):
+        own, seen = seen[: 2 * length], seen[2 * length :]
+        assert {time for time, _ in own} == {shot.time}
+        assert len(shot.rows) == 6 == len({name for _, name in own[:6]})
+    assert not seen
+
+
+def test_after_the_first_moment_tracks_alone_change(trainer: StreamTrainer) -> None:
+    through(trainer, 1)
+    assert not trainer.tracks.offsets.any() and len(trainer.model.splats) != 150
+    before = copies(trainer.model.tensors())
+    trainer.begin_next()
+    through(trainer, 3)
+    for name, tensor in trainer.model.tensors().items():
+        stays = not name.startswith("motion.")
+        assert torch.equal(tensor, before[name]) == stays, name
+    assert set(trainer.optimizer.first) == set(TRACKED)
+
+
+def test_the_loss_of_a_moment_falls(tmp_path: Path) -> None:
+    free = [f"stream.{key}=0" for key in ("rigidity", "rotation_similarity", "isometry")]
+    options = "training.steps=200", "stream.steps=60", "training.low_resolution_until=0", *free
+    trainer = stream_trainer(write_rig(tmp_path, moments=2, span=0.1), *options)
+    through(trainer, 1)
+    trainer.begin_next()
+    losses = [float(trainer.step().loss) for _ in range(60)]
+    assert sum(losses[-12:]) < sum(losses[:12])
+
+
+def test_the_result_of_a_moment_is_the_mean_of_its_last_steps(trainer: StreamTrainer) -> None:
+    through(trainer, 1)
+    trainer.begin_next()
+    while trainer.clock.progress < 1:
+        trainer.step()
+    average = copies(trainer.population.average.tensors)
+    trainer.settle()
+    assert torch.equal(trainer.tracks.offsets, average["motion.offsets"])
+    settled = copies(trainer.model.tensors())
+    trainer.settle()
+    assert_same_tensors(copies(trainer.model.tensors()), settled)
+
+
+def test_a_place_that_is_not_finite_goes_back_to_the_last_moment(trainer: StreamTrainer) -> None:
+    """Splats are never dropped: every moment's file has the same ones."""
+    through(trainer, 2)
+    trainer.begin_next()
+    trainer.step()
+    count = len(trainer.model.splats)
+    with torch.no_grad():
+        trainer.tracks.offsets[3, 1] = torch.nan
+        trainer.tracks.turns[5, 2] = torch.inf
+    past = trainer.tracks.past_offsets[3, 0].clone(), trainer.tracks.past_turns[5, 0].clone()
+    trainer._mend()
+    assert torch.equal(trainer.tracks.offsets[3], past[0])
+    assert torch.equal(trainer.tracks.turns[5], past[1])
+    while trainer.clock.progress < 1:
+        trainer.step()
+    assert len(trainer.model.splats) == count
+    assert all(t.isfinite().all() for t in trainer.model.tensors().values())
+
+
+def test_workers_change_nothing(rig: Path) -> None:
+    if not (sys.platform.startswith("linux") and jit.set_threads(2) == 2 and jit.may_fork()):
+        pytest.skip("processes cannot be forked here, or there is one core")
+    with stream_trainer(rig) as helped:
+        helped.start_workers(lambda: None)
+        assert len(helped.workers) == 2
+        through(helped, MOMENTS)
+        found = copies(helped.checkpoint().tensors)
+    jit.set_threads(0)
+    alone = stream_trainer(rig)
+    through(alone, MOMENTS)
+    assert_same_tensors(found, copies(alone.checkpoint().tensors))
+
+
+@pytest.mark.parametrize("steps", [FIRST // 2, FIRST, FIRST + 3, FIRST + EACH + 5])
+def test_a_stream_that_is_resumed_ends_as_one_that_was_not(
+    rig: Path, tmp_path: Path, steps: int
+) -> None:
+    whole, first, second = (stream_trainer(rig) for _ in range(3))
+    through(whole, MOMENTS)
+    while first.clock.step < steps:
+        if first.clock.progress >= 1:
+            first.settle()
+            first.begin_next()
+        first.step()
+    run = run_of(first, tmp_path / "run")
+    run.save(first.checkpoint())
+    second.restore(run.load())
+    assert second.clock.moment == first.clock.moment
+    assert second.clock.overall == first.clock.overall
+    through(second, MOMENTS)
+    assert_same_tensors(copies(second.checkpoint().tensors), copies(whole.checkpoint().tensors))
+
+
+def test_progress_is_that_of_the_moment_and_of_all(trainer: StreamTrainer) -> None:
+    clock = trainer.clock
+    for _ in range(FIRST // 2):
+        trainer.step()
+    assert (clock.progress, clock.overall) == (0.5, 0.5 / MOMENTS)
+    through(trainer, 1)
+    trainer.begin_next()
+    assert (clock.progress, clock.overall, clock.step) == (0.0, 1 / MOMENTS, FIRST)
+    through(trainer, MOMENTS)
+    assert (clock.progress, clock.overall) == (1.0, 1.0)
+    assert trainer.checkpoint().progress == 1.0
+
+
+def test_a_moment_may_be_given_a_time(rig: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    trainer = stream_trainer(rig, "training.budget=60s", "stream.budget=10s")
+    clock = trainer.clock
+    now = [100.0]
+    monkeypatch.setattr(module.StreamClock, "elapsed", property(lambda self: now[0] - 100.0))
+    now[0] += 30
+    assert clock.progress == 0.5
+    now[0] += 31
+    assert clock.progress == 1.0
+    clock.begin(1, preset_of("training.budget=60s", "stream.budget=10s"))
+    now[0] += 4
+    assert clock.progress == pytest.approx(0.4)
+    assert clock.spent == pytest.approx(4)
