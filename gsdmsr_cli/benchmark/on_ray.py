@@ -53,7 +53,7 @@ def connected(workers: str) -> Iterator[Any]:
 
 def _how(workers: str) -> dict[str, Any]:
     if workers.isdecimal() and int(workers) > 0:
-        return {"num_cpus": int(workers), "include_dashboard": False}
+        return {"address": "local", "num_cpus": int(workers), "include_dashboard": False}
     if workers == "auto" or re.fullmatch(r"ray://[^\s:/]+:\d+", workers):
         return {"address": workers}
     raise UsageError(

@@ -97,7 +97,7 @@ def test_data_is_kept_while_it_is_read(
         words += ["--data", run.data, "--out", tmp_path / "new"]
     monkeypatch.setattr("gsdmsr_cli.commands.eval.measure", end)
     monkeypatch.setattr(render_command, "draw_film", end)
-    monkeypatch.setattr(train_command, "_prepare", end)
+    monkeypatch.setattr(train_command, "prepare", end)
     assert gsdmsr(*words) == 3 and held == [command]
 
 

@@ -66,7 +66,7 @@ USAGE = {
         '--set losses.terms=[{"name":"rigidty"}]',
         "unknown term of the loss 'rigidty'; did you mean 'rigidity'",
     ),
-    "unknown layer": ('--set layers=[{"name":"fade"}]', "unknown layer 'fade'; known: colour, "),
+    "unknown layer": ('--set layers=[{"name":"fade"}]', "unknown layer 'fade'; known: cameras, "),
     "no value": ("--set training.steps", "a.b=value"),
     "no mapping": ("--set training=3 --steps 4", "training is 3; allowed: a mapping"),
     "bad budget": ("--budget 8x", "allowed: null or a positive duration"),
@@ -212,12 +212,12 @@ def test_a_training_holds_its_folder_from_the_first_look_to_the_last_word(
 
     first = "open_run" if how == "--resume" else "refuse_used"
     ask(first, _beginning)
-    for moment in ("read_scene", "write_json"):
+    for moment in ("read", "write_json"):
         ask(moment)
     few = [part for option in FEW for part in ("--set", option)]
     options = [*few, "--steps", 1, "--set", "training.threads=1", how]
     assert gsdmsr("train", "--data", tiny_scene, "--out", run.root, *options) == 0
-    assert asked == [first, "read_scene", "write_json"]
+    assert asked == [first, "read", "write_json"]
     with locks.sole_writer(run.root):
         assert run.training_path.is_file()
 

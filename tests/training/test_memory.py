@@ -64,7 +64,7 @@ def test_a_training_takes_what_it_is_expected_to(tmp_path: Path) -> None:
     scene = write_dnerf(tmp_path / "scene", train=100, val=1, test=1)
     for path in scene.rglob("*.png"):
         write_picture(path, noise(400, 400))
-    options = ["splats.count=150000", "density.cap=150000", "splats.start=box",
+    options = ["splats.count=400000", "density.cap=400000", "splats.start=box",
                "training.views_per_step=1", "training.steps=1000"]  # fmt: skip
     done = subprocess.run([sys.executable, "-c", MEASURED, str(scene), *options],
                           capture_output=True, text=True, check=False)  # fmt: skip
@@ -98,15 +98,16 @@ def test_a_warning_says_what_is_short_and_what_to_lower() -> None:
 def test_a_training_warns_before_it_starts(
     tiny_scene: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from gsdmsr_cli.commands import train
+    from gsdmsr_cli.commands import _preparing
+    from gsdmsr_cli.commands._party import Party
     from gsdmsr_cli.ground import limits
 
     options = ["splats.count=20", "splats.start=box", "training.threads=1"]
-    given = read_scene(tiny_scene), load_preset("dnerf", None, options), "cpu"
+    given = read_scene(tiny_scene), load_preset("dnerf", None, options), Party(), "cpu"
     monkeypatch.setattr(limits, "available_memory", lambda: 1 << 50)
-    train._prepare(*given)
+    _preparing.prepare(*given)
     assert "available" not in capsys.readouterr().err
     monkeypatch.setattr(limits, "available_memory", lambda: 1 << 20)
-    train._prepare(*given)
+    _preparing.prepare(*given)
     said = capsys.readouterr().err
     assert "warning: this training may take" in said and "and 1 MiB are available" in said

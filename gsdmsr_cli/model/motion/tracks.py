@@ -59,7 +59,7 @@ class Tracks(Layer):
         self.bound = facts.bound
         self.offsets, self.turns = torch.zeros(count, 3), torch.zeros(count, 4)
         self.past_offsets, self.past_turns = torch.zeros(count, 1, 3), torch.zeros(count, 1, 4)
-        self.times = torch.zeros(3, dtype=torch.float64)
+        self.times = torch.linspace(0, 1, 3, dtype=torch.float64)
         super().__init__(
             [
                 Parameter("offsets", self.offsets, per_splat=True, rate=options.rate),
