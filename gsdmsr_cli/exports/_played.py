@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import cast
 
-from gsdmsr_cli.exports import Facts, RunFacts
 from gsdmsr_cli.exports._asked import Asked
+from gsdmsr_cli.exports._facts import Facts, RunFacts
 from gsdmsr_cli.exports._source import Source
 from gsdmsr_cli.ground.errors import UsageError
 from gsdmsr_cli.ground.progress import OnProgress

@@ -8,8 +8,8 @@ from typing import Any
 
 import torch
 
-from gsdmsr_cli.exports import Facts
 from gsdmsr_cli.exports._asked import Asked
+from gsdmsr_cli.exports._facts import Facts
 from gsdmsr_cli.gaussians.splats import Splats
 from gsdmsr_cli.gaussians.turning import turn_world
 from gsdmsr_cli.ground.errors import DataError

@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 import torch
 
-from gsdmsr_cli.exports import Facts
+from gsdmsr_cli.exports._facts import Facts
 from gsdmsr_cli.exports._moment import require_suffix
 from gsdmsr_cli.exports._moving import Moving, evenly, in_the_mean, moving
 from gsdmsr_cli.exports._packing import Array

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import cast
 
-from gsdmsr_cli.exports import Facts, RunFacts
+from gsdmsr_cli.exports._facts import Facts, RunFacts
 from gsdmsr_cli.exports._source import Source
 from gsdmsr_cli.ground.errors import DataError
 from gsdmsr_cli.ground.progress import OnProgress

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gsdmsr_cli.exports import Facts
+from gsdmsr_cli.exports._facts import Facts
 from gsdmsr_cli.exports._moment import Options, require_suffix, splats_for, write_bytes
 from gsdmsr_cli.exports._packing import Array, beyond, morton_order, rounded, smallest_three
 from gsdmsr_cli.exports._source import Source

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from gsdmsr_cli import __version__
-from gsdmsr_cli.exports import Facts
+from gsdmsr_cli.exports._facts import Facts
 from gsdmsr_cli.exports._moment import Options, require_suffix, splats_for, write_bytes
 from gsdmsr_cli.exports._packing import Array, beyond
 from gsdmsr_cli.exports._source import Source

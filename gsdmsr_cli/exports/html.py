@@ -7,7 +7,8 @@ from pathlib import Path, PurePosixPath
 from typing import cast
 from urllib.parse import unquote, urlsplit
 
-from gsdmsr_cli.exports import Facts, RunFacts, _played
+from gsdmsr_cli.exports import _played
+from gsdmsr_cli.exports._facts import Facts, RunFacts
 from gsdmsr_cli.exports._moment import require_suffix, write_bytes
 from gsdmsr_cli.exports._played import file_of, lost
 from gsdmsr_cli.exports._source import Source

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from gsdmsr_cli.exports import Facts
+from gsdmsr_cli.exports._facts import Facts
 from gsdmsr_cli.exports._moment import require_suffix, write_bytes
 from gsdmsr_cli.exports._played import Options, file_of, lost
 from gsdmsr_cli.exports._source import Source

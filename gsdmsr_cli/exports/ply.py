@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from gsdmsr_cli.exports import Facts
+from gsdmsr_cli.exports._facts import Facts
 from gsdmsr_cli.exports._moment import Options, require_suffix
 from gsdmsr_cli.exports._ply import write_ply
 from gsdmsr_cli.exports._source import Source

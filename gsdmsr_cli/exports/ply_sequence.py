@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from gsdmsr_cli import __version__
-from gsdmsr_cli.exports import Facts
+from gsdmsr_cli.exports._facts import Facts
 from gsdmsr_cli.exports._ply import write_ply
 from gsdmsr_cli.exports._source import Source
 from gsdmsr_cli.ground.errors import DataError, UsageError

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 
 from gsdmsr_cli import __version__
-from gsdmsr_cli.exports import Facts
 from gsdmsr_cli.exports._codebooks import codebook, palette
+from gsdmsr_cli.exports._facts import Facts
 from gsdmsr_cli.exports._moment import Options, require_suffix, splats_for, write_bytes
 from gsdmsr_cli.exports._packing import Array, morton_order, rounded, smallest_three
 from gsdmsr_cli.exports._source import Source

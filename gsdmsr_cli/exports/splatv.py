@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from gsdmsr_cli.exports import Facts
 from gsdmsr_cli.exports._cubics import LARGEST, Cubics, fit
+from gsdmsr_cli.exports._facts import Facts
 from gsdmsr_cli.exports._moment import require_suffix, write_bytes
 from gsdmsr_cli.exports._moving import LEAST_TIMES, evenly, moving
 from gsdmsr_cli.exports._packing import Array, beyond, rounded

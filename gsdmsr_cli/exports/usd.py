@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from gsdmsr_cli.exports import Facts
+from gsdmsr_cli.exports._facts import Facts
 from gsdmsr_cli.exports._moving import evenly, moving
 from gsdmsr_cli.exports._packing import Array
 from gsdmsr_cli.exports._source import Source

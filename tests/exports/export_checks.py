@@ -13,7 +13,8 @@ from motion_checks import model_of
 from numpy.typing import NDArray
 from torch import Tensor
 
-from gsdmsr_cli.exports import Facts, Written, export
+from gsdmsr_cli.exports import Written, export
+from gsdmsr_cli.exports._facts import Facts
 from gsdmsr_cli.gaussians.moment import Moment
 from gsdmsr_cli.gaussians.splats import Splats
 from gsdmsr_cli.model.layer import Instant, Layer

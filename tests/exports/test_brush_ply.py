@@ -14,7 +14,8 @@ import torch
 from export_checks import Array, angles, unit, usual_splats
 from motion_checks import model_of
 
-from gsdmsr_cli.exports import Facts, Written, export
+from gsdmsr_cli.exports import Written, export
+from gsdmsr_cli.exports._facts import Facts
 from gsdmsr_cli.exports._ply import read_ply
 from gsdmsr_cli.gaussians.moment import Moment
 from gsdmsr_cli.gaussians.splats import Splats

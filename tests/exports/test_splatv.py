@@ -19,7 +19,8 @@ from motion_checks import model_of
 from node_packages import node, package
 from torch import Tensor
 
-from gsdmsr_cli.exports import Facts, Written, export
+from gsdmsr_cli.exports import Written, export
+from gsdmsr_cli.exports._facts import Facts
 from gsdmsr_cli.exports._lifetimes import ALWAYS, gaussians_of
 from gsdmsr_cli.gaussians.fading import fade
 from gsdmsr_cli.gaussians.moment import Moment

@@ -14,7 +14,8 @@ import torch
 from export_checks import usual_splats
 from motion_checks import model_of
 
-from gsdmsr_cli.exports import Facts, Written, export
+from gsdmsr_cli.exports import Written, export
+from gsdmsr_cli.exports._facts import Facts
 from gsdmsr_cli.gaussians.fading import fade
 from gsdmsr_cli.gaussians.moment import Moment
 from gsdmsr_cli.gaussians.splats import Splats
