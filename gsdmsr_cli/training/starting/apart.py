@@ -39,20 +39,19 @@ def views_with_things_apart(scene: Scene, pictures: Pictures, background: Tensor
     """
     line = (torch.arange(PLACES) + 0.5) / PLACES * 2 - 1
     grid = torch.stack(torch.meshgrid(line, line, line, indexing="ij"), dim=-1)
-    places, views = grid.reshape(-1, 3) * scene.bound, 0
-    inside = torch.zeros(len(places))
-    for outline in outlines(scene, pictures, background):
+    places, inside = grid.reshape(-1, 3) * scene.bound, torch.zeros(PLACES**3)
+    views = list(outlines(scene, pictures, background))
+    for outline in views:
         row, column, visible = outline.cells(places)
         inside += visible & outline.drawn[row, column]
-        views += 1
-    standing = places[inside >= STANDS * views]
+    standing = places[inside >= STANDS * len(views)]
     apart = 0
-    for outline in outlines(scene, pictures, background):
+    for outline in views:
         row, column, visible = outline.cells(standing)
         filled = torch.zeros_like(outline.drawn)
         filled[row[visible], column[visible]] = True
         apart += _has_thing_apart(outline.drawn.numpy(), filled.numpy())
-    return apart / views
+    return apart / len(views)
 
 
 def _has_thing_apart(drawn: NDArray[np.bool_], filled: NDArray[np.bool_]) -> bool:
