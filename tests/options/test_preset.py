@@ -275,7 +275,7 @@ def test_other_texts_are_no_durations(text: str) -> None:
 def test_the_earlier_name_of_a_motion_is_read_with_a_hint(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], in_file: bool
 ) -> None:
-    text = "base: dnerf\nmotion:\n  name: nodes\n  count: 64\n"
+    text = "base: default\nmotion:\n  name: nodes\n  count: 64\n"
     config = write(tmp_path, "config", text) if in_file else None
     overrides = [] if in_file else ["motion.name=nodes", "motion.count=64"]
     preset_files._hint.cache_clear()

@@ -26,6 +26,7 @@ from gsdmsr_cli.model.motion._rigidity import rigidity
 from gsdmsr_cli.model.parameter import name_parameters
 from gsdmsr_cli.ops import network, planes
 from gsdmsr_cli.ops.displace import OUTPUTS
+from gsdmsr_cli.options.strict import require
 
 
 @dataclass(frozen=True)
@@ -41,6 +42,8 @@ class Options:
         width: width of the network's two hidden layers, a multiple of 16.
         space_smoothness, time_smoothness, time_stillness: weights of the plane regularisers.
         rigidity: weight of the control points' deviation from rigid motion.
+        rigidity_until: progress at which that weight has fallen to 0, evenly from half of it on; 0
+            keeps the weight.
     """
 
     count: int = 1024
@@ -53,11 +56,14 @@ class Options:
     time_smoothness: float = 1e-2
     time_stillness: float = 1e-4
     rigidity: float = 0.05
+    rigidity_until: float = 0.0
 
     def __post_init__(self) -> None:
         require_points(self, self.count, self.neighbours)
         require_levels(self, "levels")
         require_multiples(self, "channels", "width")
+        ok = 0 <= self.rigidity_until <= 1
+        require(self, "rigidity_until", ok, "a progress from 0 to 1")
 
 
 class ControlPointMotion(ControlPoints):
@@ -66,6 +72,7 @@ class ControlPointMotion(ControlPoints):
     def __init__(self, options: Options, facts: Facts, generator: torch.Generator) -> None:
         super().__init__(options.count, options.neighbours, facts, generator)
         self.options = options
+        self._rigidity = options.rigidity
         times = time_nodes(facts.frames, options.time_ratio)
         self.levels = [
             planes.new_level(resolution, times, options.channels, generator)
@@ -77,6 +84,14 @@ class ControlPointMotion(ControlPoints):
             *name_parameters("grid", self.levels, "planes", planes.TIME_AXES),
             *name_parameters("network", self.layers, "network"),
         )
+
+    def advance(self, progress: float) -> None:
+        """Enter the phase of training that belongs to ``progress`` in [0, 1]."""
+        super().advance(progress)
+        o = self.options
+        if o.rigidity_until:
+            left = 2 * (1 - progress / o.rigidity_until)
+            self._rigidity = o.rigidity * min(max(left, 0.0), 1.0)
 
     def _deformation(self, points: Tensor, time: float) -> Tensor:
         """Return the outputs for points; times [0, 1] are mapped to the whole grid, [-1, 1]."""
@@ -90,13 +105,13 @@ class ControlPointMotion(ControlPoints):
         """
         o = self.options
         value = planes.penalty(self.levels, o.space_smoothness, o.time_smoothness, o.time_stillness)
-        if not o.rigidity:
+        if not self._rigidity:
             return value
         points = self.control_points.detach()
         near = self._pairs.find(points, points)
         time = float(torch.rand((), generator=generator))
         transforms = self._transforms(points, time)
-        return value + o.rigidity * rigidity(points, transforms, near)
+        return value + self._rigidity * rigidity(points, transforms, near)
 
     def check(self) -> None:
         """Raise ValueError unless control points, grid and network fit together."""

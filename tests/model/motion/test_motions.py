@@ -570,7 +570,7 @@ def test_the_time_grid_follows_from_the_frames(frames: int, resolution: int) -> 
     assert motion.tensors()["grid.0.time"].shape[2] == resolution
 
 
-def control_points_of(splats: int, **options: int) -> Layer:
+def control_points_of(splats: int, **options: float) -> Layer:
     return start_motion({"name": "control_points", **options}, FACTS, splats)
 
 
@@ -673,9 +673,13 @@ def test_control_points_follow_splats_that_have_changed_in_place() -> None:
 
 @pytest.mark.parametrize(
     ("options", "found"),
-    [({"count": 3}, "count is 3; allowed: 4 or more"), ({"neighbours": 2000}, "1 to count")],
+    [
+        ({"count": 3}, "count is 3; allowed: 4 or more"),
+        ({"neighbours": 2000}, "1 to count"),
+        ({"rigidity_until": 1.5}, "rigidity_until is 1.5; allowed: a progress from 0 to 1"),
+    ],
 )
-def test_control_points_refuse_numbers_out_of_range(options: dict[str, int], found: str) -> None:
+def test_control_points_refuse_numbers_out_of_range(options: dict[str, float], found: str) -> None:
     with pytest.raises(UsageError, match=found):
         control_points_of(1, **options)
 
@@ -720,3 +724,21 @@ def test_control_points_are_to_move_as_parts_of_a_rigid_body() -> None:
     assert "control_points" not in learnt
     loose = disturbed(started("control_points", rigidity=0.0, **NO_PLANE_TERMS))
     assert not penalty_of(loose, splats_of(COUNT), 0.6, generator())
+
+
+def test_control_points_may_move_freely_in_the_end() -> None:
+    """The weight of rigidity falls from half of ``rigidity_until`` on; by itself it stays."""
+
+    def penalties(**options: float) -> list[float]:
+        motion = disturbed(started("control_points", rigidity=2.0, **options, **NO_PLANE_TERMS))
+        values = []
+        for progress in (0.0, 0.2, 0.3, 0.375, 0.6, 1.0, 0.3):  # a resumed training may go back
+            motion.advance(progress)
+            value = penalty_of(motion, splats_of(COUNT), 0.6, generator(1))
+            values.append(0.0 if value is None else value.item())
+        return values
+
+    full = penalties()[0]
+    assert penalties() == [full] * 7
+    shares = (1.0, 1.0, 1.0, 0.75, 0.0, 0.0, 1.0)
+    assert penalties(rigidity_until=0.6) == pytest.approx([full * share for share in shares])
