@@ -15,11 +15,10 @@ from typing import Any, Literal
 from gsdmsr_cli.backends.cuda.compiler import MOST_VIEWS
 from gsdmsr_cli.ground.errors import UsageError
 from gsdmsr_cli.options import preset_files, strict
-from gsdmsr_cli.options.strict import require, require_rates
+from gsdmsr_cli.options.strict import PROGRESS, require, require_progress, require_rates
 
 _SECONDS = {"s": 1.0, "m": 60.0, "h": 3600.0}
 _DURATION = "a positive duration such as 90s, 8m or 1.5h"
-_PROGRESS = "a progress from 0 to 1"
 
 EVENTS = ("density", "opacity_reset", "thinning", "stillness")
 """Events that every training asks after a step, unless the preset says otherwise."""
@@ -44,11 +43,6 @@ def parse_duration(text: str) -> float:
     if seconds is None:
         raise UsageError(f"'{text}' is not a duration; allowed: {_DURATION}")
     return seconds
-
-
-def _require_progress(options: object, *keys: str) -> None:
-    for key in keys:
-        require(options, key, 0.0 <= getattr(options, key) <= 1.0, _PROGRESS)
 
 
 def _require_at_least(options: object, least: int, *keys: str) -> None:
@@ -105,7 +99,7 @@ class SplatOptions:
         _require_at_least(self, 1, "count")
         require(self, "opacity", 0.0 < self.opacity < 1.0, "a number between 0 and 1, neither")
         require(self, "sh_degree", 0 <= self.sh_degree <= 3, "0 to 3")
-        _require_progress(self, "sh_start")
+        require_progress(self, "sh_start")
 
 
 @dataclass(frozen=True)
@@ -162,8 +156,8 @@ class TrainingOptions:
         require(self, "views_per_step", within, f"1 to {MOST_VIEWS}")
         known = self.budget is None or _duration(self.budget) is not None
         require(self, "budget", known, f"null or {_DURATION}")
-        _require_progress(self, "static_until", "low_resolution_until", "average_from")
-        _require_progress(self, "window_until")
+        require_progress(self, "static_until", "low_resolution_until", "average_from")
+        require_progress(self, "window_until")
         require(self, "window", 0 < self.window <= 1, "a share above 0, up to 1")
         require(self, "window_at", 0 <= self.window_at <= 1, "a time from 0 to 1")
         _require_positive(self, "checkpoint_minutes")
@@ -190,7 +184,7 @@ class LossOptions:
         named = all(isinstance(entry.get("name"), str) for entry in self.terms)
         require(self, "terms", named, "a list of mappings, each with the name of a term")
         require(self, "ssim", 0.0 <= self.ssim <= 1.0, "a weight from 0 to 1")
-        _require_progress(self, "ssim_until")
+        require_progress(self, "ssim_until")
 
 
 @dataclass(frozen=True)
@@ -263,14 +257,14 @@ class DensityOptions:
     def __post_init__(self) -> None:
         _require_at_least(self, 1, "every", "rounds", "cap")
         _require_at_least(self, 0, "start")
-        _require_progress(self, "until")
+        require_progress(self, "until")
         _require_positive(self, "gradient", "split_scale", "prune_scale")
         require(self, "prune_opacity", 0.0 <= self.prune_opacity < 1.0, "0 or more, below 1")
         require(self, "reset_opacity", 0.0 < self.reset_opacity < 1.0, "above 0, below 1")
         require(self, "thin_share", 0.0 <= self.thin_share < 1.0, "0 or more, below 1")
         for key in ("reset_at", "thin_at"):
             ok = all(0.0 <= progress <= 1.0 for progress in getattr(self, key))
-            require(self, key, ok, f"a list, each item {_PROGRESS}")
+            require(self, key, ok, f"a list, each item {PROGRESS}")
 
 
 @dataclass(frozen=True)
@@ -317,7 +311,7 @@ class SaliencyOptions:
     still_below: float = 0.05
 
     def __post_init__(self) -> None:
-        _require_progress(self, "gate_from", "still_from")
+        require_progress(self, "gate_from", "still_from")
         _require_positive(self, "threshold", "low_rate", "still_below")
         require(self, "quantile", 0.0 <= self.quantile <= 1.0, "0 to 1")
         require(self, "release", 0.0 < self.release <= 1.0, "above 0, at most 1")

@@ -71,6 +71,20 @@ def require(options: object, key: str, ok: bool, allowed: str) -> None:
         raise InvalidError(key, getattr(options, key), allowed)
 
 
+PROGRESS = "a progress from 0 to 1"
+"""What is allowed where an option says when something happens in a training."""
+
+
+def require_progress(options: object, *keys: str) -> None:
+    """Check that fields are a progress, in [0, 1].
+
+    Raises:
+        InvalidError: one is not.
+    """
+    for key in keys:
+        require(options, key, 0.0 <= getattr(options, key) <= 1.0, PROGRESS)
+
+
 def require_rates(options: object, *keys: str) -> None:
     """Check that learning rates, at the start and the end of a training, are above 0.
 

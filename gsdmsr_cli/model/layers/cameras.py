@@ -28,7 +28,7 @@ from gsdmsr_cli.gaussians.torque import torque
 from gsdmsr_cli.model.layer import Facts, Instant
 from gsdmsr_cli.model.layers._views import PerView
 from gsdmsr_cli.model.view_rows import Per
-from gsdmsr_cli.options.strict import require, require_rates
+from gsdmsr_cli.options.strict import require, require_progress, require_rates
 from gsdmsr_cli.scene.camera import Camera
 
 Vector = NDArray[np.float64]
@@ -53,7 +53,7 @@ class Options:
 
     def __post_init__(self) -> None:
         require(self, "weight", self.weight >= 0, "0 or more")
-        require(self, "since", 0 <= self.since <= 1, "a progress from 0 to 1")
+        require_progress(self, "since")
         require_rates(self, "rate")
 
 

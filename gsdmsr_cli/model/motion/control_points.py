@@ -26,7 +26,7 @@ from gsdmsr_cli.model.motion._rigidity import rigidity
 from gsdmsr_cli.model.parameter import name_parameters
 from gsdmsr_cli.ops import network, planes
 from gsdmsr_cli.ops.displace import OUTPUTS
-from gsdmsr_cli.options.strict import require
+from gsdmsr_cli.options.strict import require_progress
 
 
 @dataclass(frozen=True)
@@ -62,8 +62,7 @@ class Options:
         require_points(self, self.count, self.neighbours)
         require_levels(self, "levels")
         require_multiples(self, "channels", "width")
-        ok = 0 <= self.rigidity_until <= 1
-        require(self, "rigidity_until", ok, "a progress from 0 to 1")
+        require_progress(self, "rigidity_until")
 
 
 class ControlPointMotion(ControlPoints):

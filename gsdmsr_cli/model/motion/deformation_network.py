@@ -24,7 +24,7 @@ from gsdmsr_cli.model.layer import Facts, Instant, Layer
 from gsdmsr_cli.model.limits import require_multiples
 from gsdmsr_cli.model.motion._encoded_network import MOST_OCTAVES, Shape, new_encoded_network
 from gsdmsr_cli.ops.displace import PARTS
-from gsdmsr_cli.options.strict import require
+from gsdmsr_cli.options.strict import require, require_progress
 
 LEAST_GROWTH = 1e-3
 """What an offset of a scale leaves of it at least: a scale of 0 has no logarithm."""
@@ -60,7 +60,7 @@ class Options:
             within = 0 <= getattr(self, key) <= MOST_OCTAVES
             require(self, key, within, f"0 to {MOST_OCTAVES}")
         require(self, "noise", self.noise >= 0, "0 or more")
-        require(self, "noise_until", 0 <= self.noise_until <= 1, "a progress from 0 to 1")
+        require_progress(self, "noise_until")
 
 
 class DeformationNetwork(Layer):

@@ -24,7 +24,7 @@ from gsdmsr_cli.model.limits import require_multiples
 from gsdmsr_cli.model.motion._control_points import ControlPoints, require_points
 from gsdmsr_cli.model.motion._encoded_network import MOST_OCTAVES, Shape, new_encoded_network
 from gsdmsr_cli.ops.displace import PARTS
-from gsdmsr_cli.options.strict import require
+from gsdmsr_cli.options.strict import require, require_progress
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ class Options:
 
     def __post_init__(self) -> None:
         require_points(self, self.count, self.neighbours)
-        require(self, "alone_until", 0 <= self.alone_until <= 1, "a progress from 0 to 1")
+        require_progress(self, "alone_until")
         require_multiples(self, "width")
         require(self, "depth", 2 <= self.depth <= 16, "2 to 16")
         for key in ("position_octaves", "time_octaves"):

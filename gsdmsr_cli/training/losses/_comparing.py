@@ -11,7 +11,7 @@ from torch import Tensor
 
 from gsdmsr_cli.gaussians.splats import Splats
 from gsdmsr_cli.ops.finite import finite_rows
-from gsdmsr_cli.options.strict import require
+from gsdmsr_cli.options.strict import require, require_progress
 from gsdmsr_cli.scene.scene import View
 from gsdmsr_cli.training.losses import Seen, Term
 
@@ -30,7 +30,7 @@ class Schedule:
 
     def __post_init__(self) -> None:
         require(self, "factor", self.factor > 0, "a number above 0")
-        require(self, "until", 0 <= self.until <= 1, "a progress from 0 to 1")
+        require_progress(self, "until")
 
 
 class ComparingTerm(Term):

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from gsdmsr_cli.drawing.flow import blend_motion, screen_motion
-from gsdmsr_cli.options.strict import require
+from gsdmsr_cli.options.strict import require, require_progress
 from gsdmsr_cli.raster import Engine
 from gsdmsr_cli.runs.outputs import FLOW
 from gsdmsr_cli.scene.neighbours import LEAST_SHARE, neighbours
@@ -44,7 +44,7 @@ class Options:
 
     def __post_init__(self) -> None:
         require(self, "factor", self.factor > 0, "a number above 0")
-        require(self, "since", 0 <= self.since <= 1, "a progress from 0 to 1")
+        require_progress(self, "since")
         within = self.since < self.until <= 1
         require(self, "until", within, f"a progress above since, which is {self.since:g}, up to 1")
 

@@ -14,7 +14,7 @@ from gsdmsr_cli.ground.errors import UsageError
 from gsdmsr_cli.model.distilling import Distilling
 from gsdmsr_cli.model.model import STORED
 from gsdmsr_cli.options.preset import Preset
-from gsdmsr_cli.options.strict import require
+from gsdmsr_cli.options.strict import require_progress
 from gsdmsr_cli.training.population import Tick
 from gsdmsr_cli.training.population._once import Once
 from gsdmsr_cli.training.resizing import Population
@@ -31,7 +31,7 @@ class Options:
     at: float = 0.5
 
     def __post_init__(self) -> None:
-        require(self, "at", 0 <= self.at <= 1, "a progress from 0 to 1")
+        require_progress(self, "at")
 
 
 class Distil(Once):
