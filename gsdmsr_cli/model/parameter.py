@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Protocol
@@ -16,6 +16,14 @@ Rate = str | tuple[float, float]
 values at the start and at the end of a training, log-linear in between."""
 
 NO_TIMES: Mapping[str, int] = MappingProxyType({})
+
+Place = Callable[[float], float]
+"""Where a time in [0, 1] lies between the first and the last entry of a time axis, in [0, 1]."""
+
+
+def evenly(time: float) -> float:
+    """Return where a time lies on an axis whose entries belong to times that are evenly spaced."""
+    return time
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,7 +40,8 @@ class Parameter:
         rate: the learning rate that it follows; None for a buffer, of any dtype, that is saved but
             not trained.
         fill: value of a row that is new: of a splat that has stood still and begins to move.
-        time_axis: the dimension whose entries belong to times, evenly from 0 to 1, if there is one.
+        time_axis: the dimension whose entries belong to times from 0 to 1, if there is one.
+        time_place: where times lie on it; it rises from 0 to 1.
     """
 
     name: str
@@ -41,6 +50,7 @@ class Parameter:
     rate: Rate | None = None
     fill: float = 0.0
     time_axis: int | None = None
+    time_place: Place = evenly
 
     def __post_init__(self) -> None:
         self.tensor.requires_grad_(self.rate is not None)
@@ -63,7 +73,8 @@ class Parameter:
             return
         values = self.tensor.detach().movedim(self.time_axis, 0)
         end = len(values) - 1
-        lower, upper = math.floor(first * end), math.ceil(last * end)
+        lower = math.floor(self.time_place(first) * end)
+        upper = math.ceil(self.time_place(last) * end)
         values[:lower] = values[lower].clone()
         values[upper + 1 :] = values[upper].clone()
 
@@ -88,7 +99,11 @@ class Part(Protocol):
 
 
 def name_parameters(
-    name: str, parts: Sequence[Part], rate: Rate, time_axes: Mapping[str, int] = NO_TIMES
+    name: str,
+    parts: Sequence[Part],
+    rate: Rate,
+    time_axes: Mapping[str, int] = NO_TIMES,
+    time_place: Place = evenly,
 ) -> list[Parameter]:
     """Return a grid's levels or a network's layers as parameters "name.0.space" and so on.
 
@@ -97,9 +112,16 @@ def name_parameters(
         parts: the levels or layers.
         rate: the learning rate that all follow.
         time_axes: dimensions that run over times, by the names of the parts' fields.
+        time_place: where times lie on those.
     """
     return [
-        Parameter(f"{name}.{index}.{field}", tensor, rate=rate, time_axis=time_axes.get(field))
+        Parameter(
+            f"{name}.{index}.{field}",
+            tensor,
+            rate=rate,
+            time_axis=time_axes.get(field),
+            time_place=time_place,
+        )
         for index, part in enumerate(parts)
         for field, tensor in part._asdict().items()
     ]

@@ -7,8 +7,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gsdmsr_cli.model.motion._grids import between
-from gsdmsr_cli.model.parameter import NO_TIMES, Parameter, name_parameters
+from gsdmsr_cli.model.motion._grids import between, sparser_at_ends
+from gsdmsr_cli.model.parameter import NO_TIMES, Parameter, evenly, name_parameters
 from gsdmsr_cli.ops import planes
 
 TIMES = [0.0, 0.25, 0.5, 0.75, 1.0]
@@ -36,15 +36,18 @@ def test_times_outside_are_as_the_nearest_that_count_within(
 
 
 @settings(deadline=None)
-@given(st.integers(2, 9), st.floats(0, 1), st.floats(0, 1), st.floats(0, 1))
+@given(
+    st.integers(2, 9), st.floats(0, 1), st.floats(0, 1), st.floats(0, 1), st.sampled_from([1, 0.5])
+)
 def test_what_is_shown_stays_and_what_is_not_stands_still(
-    nodes: int, one: float, other: float, time: float
+    nodes: int, one: float, other: float, time: float, ends: float
 ) -> None:
+    place = sparser_at_ends(ends)
     first, last = sorted((one, other))
     before = torch.rand(nodes, generator=torch.Generator().manual_seed(nodes))
-    parameter = Parameter("x", before.clone(), rate="planes", time_axis=0)
+    parameter = Parameter("x", before.clone(), rate="planes", time_axis=0, time_place=place)
     parameter.hold_outside(first, last)
-    after = parameter.tensor.detach()
+    after, first, last, time = parameter.tensor.detach(), place(first), place(last), place(time)
     if first <= time <= last:
         torch.testing.assert_close(between(after, time), between(before, time))
     cell = 1 / (nodes - 1)
@@ -52,6 +55,19 @@ def test_what_is_shown_stays_and_what_is_not_stands_still(
         torch.testing.assert_close(between(after, time), after[-1])
     if time <= first - cell:
         torch.testing.assert_close(between(after, time), after[0])
+
+
+@settings(deadline=None)
+@given(st.floats(0.01, 1), st.floats(0, 1), st.floats(0, 1))
+def test_nodes_are_sparser_at_both_ends(density: float, one: float, other: float) -> None:
+    place = sparser_at_ends(density)
+    assert (place(0), place(1)) == pytest.approx((0, 1)) and place(0.5) == 0.5
+    before, after = sorted((one, other))
+    assert 0 <= place(before) <= place(after) + 1e-15 <= 1 + 2e-15, "times keep their order"
+    step = 1e-6
+    for slope in (place(step) / step, (1 - place(1 - step)) / step):
+        assert slope == pytest.approx(density, abs=1e-4)
+    assert sparser_at_ends(1.0) is evenly
 
 
 def test_without_times_nothing_changes() -> None:

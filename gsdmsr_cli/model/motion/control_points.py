@@ -20,13 +20,13 @@ from gsdmsr_cli.gaussians.splats import Splats
 from gsdmsr_cli.model.layer import Facts, Instant
 from gsdmsr_cli.model.limits import require_multiples
 from gsdmsr_cli.model.motion._control_points import ControlPoints, require_points
-from gsdmsr_cli.model.motion._grids import time_nodes
+from gsdmsr_cli.model.motion._grids import sparser_at_ends, time_nodes
 from gsdmsr_cli.model.motion._limits import require_levels
 from gsdmsr_cli.model.motion._rigidity import rigidity
 from gsdmsr_cli.model.parameter import name_parameters
 from gsdmsr_cli.ops import network, planes
 from gsdmsr_cli.ops.displace import OUTPUTS
-from gsdmsr_cli.options.strict import require_progress
+from gsdmsr_cli.options.strict import require, require_progress
 
 
 @dataclass(frozen=True)
@@ -39,6 +39,8 @@ class Options:
         levels: resolution of each of the grid's 1 to 8 levels along a spatial axis.
         channels: features per level, a multiple of 16.
         time_ratio: the grid's resolution in time per distinct train time.
+        time_ends: density of the grid's nodes at the first and the last time, in units of that of
+            an even grid: above 0, at most 1.
         width: width of the network's two hidden layers, a multiple of 16.
         space_smoothness, time_smoothness, time_stillness: weights of the plane regularisers.
         rigidity: weight of the control points' deviation from rigid motion.
@@ -51,6 +53,7 @@ class Options:
     levels: tuple[int, ...] = (16, 32)
     channels: int = 16
     time_ratio: float = 0.2
+    time_ends: float = 1.0
     width: int = 32
     space_smoothness: float = 1e-4
     time_smoothness: float = 1e-2
@@ -62,6 +65,7 @@ class Options:
         require_points(self, self.count, self.neighbours)
         require_levels(self, "levels")
         require_multiples(self, "channels", "width")
+        require(self, "time_ends", 0 < self.time_ends <= 1, "above 0, at most 1")
         require_progress(self, "rigidity_until")
 
 
@@ -73,6 +77,7 @@ class ControlPointMotion(ControlPoints):
         self.options = options
         self._rigidity = options.rigidity
         times = time_nodes(facts.frames, options.time_ratio)
+        self._place = sparser_at_ends(options.time_ends)
         self.levels = [
             planes.new_level(resolution, times, options.channels, generator)
             for resolution in options.levels
@@ -80,7 +85,7 @@ class ControlPointMotion(ControlPoints):
         widths = [options.channels * len(options.levels), options.width, options.width, OUTPUTS]
         self.layers = network.new_network(widths, generator)
         self._parameters += (
-            *name_parameters("grid", self.levels, "planes", planes.TIME_AXES),
+            *name_parameters("grid", self.levels, "planes", planes.TIME_AXES, self._place),
             *name_parameters("network", self.layers, "network"),
         )
 
@@ -94,7 +99,8 @@ class ControlPointMotion(ControlPoints):
 
     def _deformation(self, points: Tensor, time: float) -> Tensor:
         """Return the outputs for points; times [0, 1] are mapped to the whole grid, [-1, 1]."""
-        features = planes.lookup(self.levels, points, 2 * time - 1, self.facts.box)
+        place = 2 * self._place(time) - 1
+        features = planes.lookup(self.levels, points, place, self.facts.box)
         return network.apply_network(self.layers, features)
 
     def penalty(self, moment: Moment, instant: Instant, generator: torch.Generator) -> Tensor:

@@ -676,6 +676,8 @@ def test_control_points_follow_splats_that_have_changed_in_place() -> None:
     [
         ({"count": 3}, "count is 3; allowed: 4 or more"),
         ({"neighbours": 2000}, "1 to count"),
+        ({"time_ends": 0.0}, "time_ends is 0.0; allowed: above 0, at most 1"),
+        ({"time_ends": 1.5}, "time_ends is 1.5; allowed: above 0, at most 1"),
         ({"rigidity_until": 1.5}, "rigidity_until is 1.5; allowed: a progress from 0 to 1"),
     ],
 )
@@ -724,6 +726,25 @@ def test_control_points_are_to_move_as_parts_of_a_rigid_body() -> None:
     assert "control_points" not in learnt
     loose = disturbed(started("control_points", rigidity=0.0, **NO_PLANE_TERMS))
     assert not penalty_of(loose, splats_of(COUNT), 0.6, generator())
+
+
+def test_control_points_may_have_fewer_nodes_at_both_ends() -> None:
+    """Half as dense at the ends: u = 2 t - 1 is read at (u - 0.2 u^3) / 0.8 (float64)."""
+    even, uneven = (
+        disturbed(started("control_points", COUNT, time_ends=ends)) for ends in (1.0, 0.5)
+    )
+    splats = splats_of(COUNT)
+    for time in (0.0, 0.1, 0.5, 0.8, 1.0):
+        u = 2 * time - 1
+        place = ((u - 0.2 * u**3) / 0.8 + 1) / 2
+        expected = moved_by(even, splats, place)
+        assert_equal(moved_by(uneven, splats, time), expected, rtol=1e-4, atol=1e-5)
+    before = [moved_by(uneven, splats, time) for time in (0.4, 0.5, 0.6)]
+    model_of(splats, uneven).hold_outside(0.4, 0.6)
+    for time, expected in zip((0.4, 0.5, 0.6), before, strict=True):
+        assert_equal(moved_by(uneven, splats, time), expected, rtol=1e-5, atol=1e-6)
+    still = [moved_by(uneven, splats, time) for time in (0.8, 1.0)]
+    assert_equal(*still, rtol=1e-5, atol=1e-6)
 
 
 def test_control_points_may_move_freely_in_the_end() -> None:
