@@ -240,7 +240,12 @@ class Trainer:
         return [self._order(row, progress) for row in rows]
 
     def _next_row(self, progress: float) -> int:
-        """Return the next view of a random order that visits every view before any again."""
+        """Return a view that the window wants, or else the next one of a random order.
+
+        That order visits every view before any again.
+        """
+        if (newest := self.window.draw_newest(progress, self.generator)) is not None:
+            return newest
         while True:
             if not self.queue:
                 self.queue = torch.randperm(len(self.views), generator=self.generator).tolist()

@@ -4,7 +4,9 @@ What moves farther than its own size is a smear in the mean over all moments, an
 against a plain background it is worth nothing there: its splats turn transparent, and nothing is
 left to learn a motion. In a short time about one moment it hardly moves. From there on it is
 followed, as the window grows: times that no view has shown yet are held at the nearest one that has
-been, so that what comes next is near where it is looked for.
+been, so that what comes next is near where it is looked for. The more views there are, the rarer
+each of the last comes; where they come no oftener than others, the window runs away from what it
+is to follow.
 """
 
 from __future__ import annotations
@@ -13,12 +15,16 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 
+import torch
 from torch import Tensor
 
 from gsdmsr_cli.options.preset import TrainingOptions
 from gsdmsr_cli.scene.pictures import Pictures
 from gsdmsr_cli.scene.scene import Scene
 from gsdmsr_cli.training.starting.apart import views_with_things_apart
+
+NEWEST = 0.1
+"""Share of all views that count as those that have come last."""
 
 FEW = 0.05
 """Share of the views that may show something apart by chance."""
@@ -29,7 +35,7 @@ class Window:
 
     Args:
         times: of all train views, in [0, 1].
-        options: see ``window``, ``window_until`` and ``window_at`` there.
+        options: see those there that begin with ``window``, but for ``window_if``.
 
     Attributes:
         note: why not all views are seen from the start, to be said to who trains, if so.
@@ -40,12 +46,25 @@ class Window:
     def __init__(self, times: Sequence[float], options: TrainingOptions) -> None:
         self._options = options
         nearest = sorted(range(len(times)), key=lambda row: abs(times[row] - options.window_at))
-        self._place = {row: place for place, row in enumerate(nearest)}
+        self._nearest, self._place = nearest, {row: place for place, row in enumerate(nearest)}
         self._times = [times[row] for row in nearest]
 
     def shows(self, row: int, progress: float) -> bool:
         """Return whether a view may be seen; there always is one at least that may."""
         return self._place[row] < self._count(progress)
+
+    def draw_newest(self, progress: float, generator: torch.Generator) -> int | None:
+        """Return one of the views that have come last, or None if any may be next.
+
+        While the window grows it is the former with the probability ``window_newest``.
+        """
+        share, count = self._options.window_newest, self._count(progress)
+        if not share or count == len(self._nearest):
+            return None
+        if float(torch.rand((), generator=generator)) >= share:
+            return None
+        last = min(math.ceil(NEWEST * len(self._nearest)), count)
+        return self._nearest[count - 1 - int(torch.randint(last, (), generator=generator))]
 
     def extent(self, progress: float) -> tuple[float, float] | None:
         """Return the first and the last time that may be seen, or None if all may."""

@@ -50,6 +50,30 @@ def test_nearer_views_come_first_and_none_goes_again(
     assert not hidden or max(abs(times[row] - at) for row in before) <= min(hidden)
 
 
+def newest(window: Window, progress: float, draws: int = 400) -> list[int | None]:
+    generator = torch.Generator().manual_seed(1)
+    return [window.draw_newest(progress, generator) for _ in range(draws)]
+
+
+def test_the_views_that_came_last_may_be_drawn_oftener() -> None:
+    """Of 40 views that grow from one end of time, the last four of those that are seen."""
+    times = [row / 39 for row in range(40)]
+    options = TrainingOptions(
+        window=0.05, window_until=1.0, window_at=0.0, static_until=0.0, window_newest=0.5
+    )
+    window = Window(times, options)
+    drawn = newest(window, 0.5)
+    count = len(seen(window, 0.5, 40))
+    assert set(drawn) == {None, *range(count - 4, count)}
+    assert 160 <= drawn.count(None) <= 240, "one in two"
+    assert set(newest(window, 0.0)) == {None, 0, 1}, "there are two"
+    assert set(newest(window, 1.0)) == {None}, "all are seen"
+    rarely = Window(times, TrainingOptions(window=0.05, window_until=1.0, window_at=0.0))
+    before = (generator := torch.Generator()).get_state()
+    assert rarely.draw_newest(0.5, generator) is None
+    assert torch.equal(generator.get_state(), before), "older runs draw what they did"
+
+
 def test_extent_is_that_of_the_times_that_are_seen() -> None:
     window = Window(TIMES, TrainingOptions(window=0.5, window_until=1.0, window_at=0.5))
     assert window.extent(0.0) == (0.4, 0.7)
@@ -91,6 +115,17 @@ def test_a_training_sees_no_other_views(tiny_scene: Path) -> None:
     for progress, count in ((0.0, 3), (0.5, 8), (1.0, 12)):
         rows = {trainer._next_row(progress) for _ in range(200)}
         assert {trainer.views[row].time for row in rows} == set(times[:count])
+
+
+def test_a_training_draws_what_came_last(tiny_scene: Path) -> None:
+    options = "training.window=0.5", "training.window_until=1.0", "training.window_at=0.0"
+    further = "training.window_if=always", "training.static_until=0", "training.window_newest=1"
+    trainer = trainer_of(tiny_scene, preset_of(*options, *further))
+    times = sorted(view.time for view in trainer.views)
+    rows = {trainer._next_row(0.0) for _ in range(50)}
+    assert {trainer.views[row].time for row in rows} == set(times[4:6]), "2 of 12 are a tenth"
+    rows = {trainer._next_row(1.0) for _ in range(200)}
+    assert {trainer.views[row].time for row in rows} == set(times)
 
 
 @pytest.mark.parametrize(
