@@ -25,7 +25,8 @@ OPTIONS = (
     f"training.steps={STEPS}", "training.static_until=0.1", "training.views_per_step=1",
     "splats.count=120", "splats.start=box", "splats.sh_start=0.5",
     "density.start=6", "density.every=6", "density.until=0.8", "density.gradient=1e-7",
-    "density.cap=200", "density.reset_at=[0.4]",
+    "density.cap=200", "density.reset_at=[0.4]", "density.thin_at=[]",
+    "optimizer.log_scales=[5e-3,2e-3]",
 )  # fmt: skip
 """Every phase of a training within 40 steps: static, coarse, fine; growing, a reset, pruning."""
 

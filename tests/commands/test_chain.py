@@ -33,6 +33,7 @@ STEPS = 60
 
 SETTINGS = (
     "splats.count=400", "density.start=10", "density.every=10", "density.cap=600",
+    "density.thin_at=[]",
     "training.static_until=0.2",
     "optimizer.planes=[0.05,0.01]", "optimizer.network=[0.02,0.002]",
 )  # fmt: skip

@@ -50,7 +50,7 @@ def test_a_file_without_a_base_stands_over_what_the_data_calls_for(
     path = config(tmp_path, "density: {cap: 777}")
     chosen = Choice(None, path, STEPS).suit(scene)
     assert chosen.options == load_preset("dnerf", path, STEPS)
-    assert chosen.options.density.cap == 777 and chosen.options.density.rounds == 24
+    assert chosen.options.density.cap == 777 and chosen.options.density.rounds == 48
     assert chosen.name == "mine.yaml" and chosen.reason is not None
 
 
@@ -137,7 +137,7 @@ def test_a_dry_run_says_what_would_be_done_and_writes_nothing(
     assert not run.exists() and sorted(tiny_scene.rglob("*")) == before
     assert (plan["preset"], plan["splats"], plan["length"]) == ("dnerf", 50, "9 steps")
     assert plan["reason"].startswith("preset dnerf, since") and plan["begins_at_step"] == 0
-    assert plan["options"]["splats.count"] == 50 and plan["options"]["density.gradient"] == 7e-4
+    assert plan["options"]["splats.count"] == 50 and plan["options"]["density.gradient"] == 3e-4
     assert "density.cap" not in plan["options"]  # which is the default
     assert plan["scene"]["pictures"]["train"] == 12 and plan["size"] == [48, 48]
     assert plan["device"] == "cpu" and 1 <= plan["processes"] <= 2

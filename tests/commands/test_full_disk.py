@@ -19,7 +19,13 @@ from gsdmsr_cli.evaluation import speed
 from gsdmsr_cli.exports._ply import read_ply
 from gsdmsr_cli.runs.run import open_run
 
-FEW = "--preset=dnerf", "--steps=2", "--threads=1", "--set=splats.count=100"
+FEW = (
+    "--preset=dnerf",
+    "--steps=2",
+    "--threads=1",
+    "--set=splats.count=100",
+    "--set=density.thin_at=[]",
+)
 
 Gsdmsr = Callable[..., tuple[int, str]]
 
