@@ -46,7 +46,8 @@ class Window:
     def __init__(self, times: Sequence[float], options: TrainingOptions) -> None:
         self._options = options
         nearest = sorted(range(len(times)), key=lambda row: abs(times[row] - options.window_at))
-        self._nearest, self._place = nearest, {row: place for place, row in enumerate(nearest)}
+        self._nearest = nearest
+        self._place = {row: place for place, row in enumerate(nearest)}
         self._times = [times[row] for row in nearest]
 
     def shows(self, row: int, progress: float) -> bool:
