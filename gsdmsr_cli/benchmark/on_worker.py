@@ -41,8 +41,9 @@ def do(line: Line, log: str, threads: int, needs: Mapping[str, Any]) -> tuple[st
                 time.sleep(_POLL_S)  # Ray's interrupt comes between two calls, and ends none
             break
         except KeyboardInterrupt:
+            if not interrupted:  # a second one would keep it from saving what it has
+                process.send_signal(signal.SIGINT)
             interrupted = True
-            process.send_signal(signal.SIGINT)
     return host, INTERRUPTED if interrupted else process.returncode, ""
 
 

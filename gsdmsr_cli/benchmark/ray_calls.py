@@ -6,6 +6,7 @@ lost, what is left to do is looked up anew, and only the task of that worker beg
 
 from __future__ import annotations
 
+import math
 import signal
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -24,6 +25,9 @@ RETRIES = 3
 """How often a command is begun again whose worker is lost."""
 
 _POLL_S = 0.2
+
+_CANCEL_AGAIN_S = 10.0
+"""After that time a task is cancelled once more: an interrupt in a worker can be lost [s]."""
 
 _PAUSE_S = 1.0
 """Before a command is begun again: what the lost worker has started ends first [s]."""
@@ -89,6 +93,7 @@ class _Calls:
         self._running: dict[Any, _Work] = {}
         self._failures: list[str] = []
         self._interrupted = False
+        self._cancelled = -math.inf
 
     def make(self, works: Mapping[Path, Callable[[], Iterator[Line]]]) -> None:
         """Run all works to their ends; see ``call_on_ray``."""
@@ -99,18 +104,24 @@ class _Calls:
                 done, _ = self._ray.wait([*self._running], timeout=_POLL_S)
                 for task in done:
                     self._take(task, self._running.pop(task))
-                if self._wanted() and not self._interrupted:
+                if self._wanted():
                     self._interrupt()
         finally:
-            self._interrupt()  # what an error leaves behind
-            if self._running:
-                self._ray.wait([*self._running], num_returns=len(self._running))
+            while self._running:  # what an error leaves behind
+                self._interrupt()
+                for task in self._ray.wait([*self._running], timeout=_POLL_S)[0]:
+                    del self._running[task]
         if self._interrupted:
             raise KeyboardInterrupt
         if self._failures:
             raise GsdmsrError("; ".join(self._failures))
 
     def _interrupt(self) -> None:
+        """Cancel what runs, if that was not done just now."""
+        now = time.monotonic()
+        if now - self._cancelled < _CANCEL_AGAIN_S:
+            return
+        self._cancelled = now
         for task in self._running:
             self._interrupted = True
             self._ray.cancel(task)  # a KeyboardInterrupt there: a training saves what it has
