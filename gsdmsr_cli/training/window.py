@@ -33,6 +33,8 @@ FEW = 0.05
 class Window:
     """The views that are nearest to a moment, of which there are more and more.
 
+    Where all views show the same moment, all are seen: none is nearer to another one.
+
     Args:
         times: of all train views, in [0, 1].
         options: see those there that begin with ``window``, but for ``window_if``.
@@ -44,7 +46,7 @@ class Window:
     note: str | None = None
 
     def __init__(self, times: Sequence[float], options: TrainingOptions) -> None:
-        self._options = options
+        self._options = options if len(set(times)) > 1 else replace(options, window=1.0)
         nearest = sorted(range(len(times)), key=lambda row: abs(times[row] - options.window_at))
         self._nearest = nearest
         self._place = {row: place for place, row in enumerate(nearest)}
@@ -92,12 +94,12 @@ def start_window(
         pictures: the train pictures, composited on ``background`` (3,).
     """
     times = [view.time for view in scene.split("train")]
-    if options.window == 1 or options.window_if == "always":
-        return Window(times, options)
+    window = Window(times, options)
+    if window.extent(0.0) is None or options.window_if == "always":
+        return window
     share = views_with_things_apart(scene, pictures, background)
     if share <= FEW:
         return Window(times, replace(options, window=1.0))
-    window = Window(times, options)
     window.note = (
         f"in {share:.0%} of the train views something lies apart from all that stands: those about "
         f"time {options.window_at:g} are seen first (training.window)"

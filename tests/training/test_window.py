@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -13,6 +14,7 @@ from training_checks import preset_of, trainer_of
 
 from gsdmsr_cli.ground.errors import UsageError
 from gsdmsr_cli.options.preset import TrainingOptions
+from gsdmsr_cli.scene.scene import Scene
 from gsdmsr_cli.training.window import Window, start_window
 
 TIMES = [0.9, 0.1, 0.5, 0.3, 0.7, 0.4]
@@ -36,6 +38,12 @@ def test_all_are_seen_from_the_start_unless_it_is_asked_for() -> None:
     assert seen(Window(TIMES, TrainingOptions(window=0.1, window_until=0.0)), 0.0) == [*range(6)]
 
 
+def test_all_views_of_a_single_moment_are_seen_from_the_start() -> None:
+    window = Window([0.3] * 6, TrainingOptions(window=0.1, window_newest=1.0))
+    assert seen(window, 0.0) == [*range(6)] and window.extent(0.0) is None
+    assert set(newest(window, 0.0)) == {None}
+
+
 @given(
     st.lists(st.floats(0, 1), min_size=1, max_size=20),
     st.floats(0.001, 1), st.floats(0, 1), st.floats(0, 1), st.floats(0, 1), st.floats(0, 1),
@@ -48,6 +56,14 @@ def test_nearer_views_come_first_and_none_goes_again(
     assert before and set(before) <= set(after)
     hidden = [abs(t - at) for row, t in enumerate(times) if row not in before]
     assert not hidden or max(abs(times[row] - at) for row in before) <= min(hidden)
+
+
+def moments(count: int) -> Scene:
+    """Return a scene with a view of each of so many moments."""
+    scene = scene_of(cameras(count, 16))
+    times = [row / (count - 1) for row in range(count)]
+    views = (replace(view, time=at) for view, at in zip(scene.views, times, strict=True))
+    return replace(scene, views=tuple(views))
 
 
 def newest(window: Window, progress: float, draws: int = 400) -> list[int | None]:
@@ -148,9 +164,8 @@ def test_if_apart_it_depends_on_what_the_views_show(
     share: float, seen_at_first: int, told: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("gsdmsr_cli.training.window.views_with_things_apart", lambda *_: share)
-    shots = cameras(16, 16)
     options = TrainingOptions(window=0.25, window_if="apart")
-    window = start_window(scene_of(shots), Album([]), torch.ones(3), options)
+    window = start_window(moments(16), Album([]), torch.ones(3), options)
     assert len(seen(window, 0.0, 16)) == seen_at_first
     assert (window.note is not None) == told
     assert not told or "in 11% of the train views" in str(window.note)
@@ -158,5 +173,5 @@ def test_if_apart_it_depends_on_what_the_views_show(
 
 def test_always_asks_nothing_of_the_pictures() -> None:
     options = TrainingOptions(window=0.25, window_if="always")
-    window = start_window(scene_of(cameras(16, 16)), Album([]), torch.ones(3), options)
+    window = start_window(moments(16), Album([]), torch.ones(3), options)
     assert len(seen(window, 0.0, 16)) == 4 and window.note is None
