@@ -2,7 +2,8 @@
 
     python docs/pictures/beside.py OUT.webp VIEW[,VIEW...] RUN RUN...
 
-A row for each view, by the name that it has in the report; all runs are of the same data and size.
+A row for each view, by the name that it has in the report, at half the size; all runs are of the
+same data and size.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from torch import Tensor
 
 from gsdmsr_cli.commands._trained import open_trained
 from gsdmsr_cli.scene.imaging import encode_webp
+from gsdmsr_cli.scene.native import cv2
 
 QUALITY = 80
 """Of WebP, 0 to 100."""
@@ -32,7 +34,9 @@ def main(out: Path, names: list[str], runs: list[Path]) -> None:
             drawn = [one.renderer.draw(views[name]) for one in opened]
             rows.append([_eight_bits(p) for p in (*drawn, opened[0].renderer.true(views[name]))])
     pixels = np.concatenate([np.concatenate(row, axis=1) for row in rows])
-    out.write_bytes(encode_webp(pixels, QUALITY))
+    height, width = pixels.shape[0] // 2, pixels.shape[1] // 2
+    halved = cv2.resize(pixels, (width, height), interpolation=cv2.INTER_AREA)
+    out.write_bytes(encode_webp(np.asarray(halved, np.uint8), QUALITY))
 
 
 def _eight_bits(picture: Tensor) -> NDArray[np.uint8]:
