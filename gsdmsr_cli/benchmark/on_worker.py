@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import platform
 import signal
+import subprocess
 import time
 from collections.abc import Mapping
 from pathlib import Path
@@ -19,6 +20,9 @@ _POLL_S = 0.1
 def do(line: Line, log: str, threads: int, needs: Mapping[str, Any]) -> tuple[str, int, str]:
     """Run a command to its end; Ctrl-C, as which a cancelled task sees it, is handed on.
 
+    A cluster that was started in the background of a script ignores Ctrl-C, and so do its workers
+    unless they are told otherwise: Python drops the interrupt without a word.
+
     Args:
         line: the command line, empty to look only.
         log: file that all it shows is added to.
@@ -33,7 +37,16 @@ def do(line: Line, log: str, threads: int, needs: Mapping[str, Any]) -> tuple[st
         return host, DataError.exit_code, missing
     if not line:
         return host, 0, ""
-    process = start_logged(line, Path(log), threads, ends_with_us=True)
+    earlier = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        process = start_logged(line, Path(log), threads, ends_with_us=True)
+        return host, _result(process), ""
+    finally:
+        signal.signal(signal.SIGINT, earlier)
+
+
+def _result(process: subprocess.Popen[bytes]) -> int:
+    """Return the exit code of a command that has ended, handing the first Ctrl-C on until then."""
     interrupted = False
     while True:
         try:
@@ -44,7 +57,7 @@ def do(line: Line, log: str, threads: int, needs: Mapping[str, Any]) -> tuple[st
             if not interrupted:  # a second one would keep it from saving what it has
                 process.send_signal(signal.SIGINT)
             interrupted = True
-    return host, INTERRUPTED if interrupted else process.returncode, ""
+    return INTERRUPTED if interrupted else process.returncode
 
 
 def lack(needs: Mapping[str, Any]) -> str:
