@@ -20,7 +20,7 @@ from gsdmsr_cli.commands._trained import open_trained
 from gsdmsr_cli.scene.imaging import encode_webp
 from gsdmsr_cli.scene.native import cv2
 
-QUALITY = 80
+QUALITY = 75
 """Of WebP, 0 to 100."""
 
 
