@@ -50,7 +50,7 @@ def train(gsdmsr: Gsdmsr) -> Callable[[Path, Path], None]:
 
     def call(data: Path, out: Path) -> None:
         options = [word for option in QUICK for word in ("--set", option)]
-        line = "train", "--data", data, "--out", out, "--preset", "dnerf", "--steps", 80
+        line = "train", "--data", data, "--out", out, "--preset", "dnerf", "--steps", 200
         assert gsdmsr(*line, *options)[0] == 0
 
     return call
