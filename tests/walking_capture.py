@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -27,6 +27,9 @@ OFF_PATH = math.radians(15)
 """Angle between the path and the test cameras."""
 
 
+_ON_STAGE = np.random.default_rng(0).uniform(-0.8, 0.8, (60, 3))
+
+
 @dataclass(frozen=True)
 class Capture:
     """What is not known in training.
@@ -35,11 +38,13 @@ class Capture:
         cameras: of the train pictures, as they were.
         given: as the capture says they were.
         exposures: (V, 3) factors on the colours.
+        points: (P, 3) places that all cameras see, by which their errors are told.
     """
 
     cameras: Sequence[Camera]
     given: Sequence[Camera]
     exposures: NDArray[np.float64]
+    points: NDArray[np.float64] = field(default_factory=lambda: _ON_STAGE)
 
 
 def write_capture(
@@ -59,9 +64,9 @@ def write_capture(
     rng = np.random.default_rng(seed)
     times = np.linspace(0, 1, frames)
     true = [_on_path(time, size) for time in times]
-    wrong = _pose_errors(true, pixels, times, rng)
+    wrong = pose_errors(true, pixels, times, rng)
     given = [corrected(camera, error) for camera, error in zip(true, wrong, strict=True)]
-    exposures = _drift(times, drift, rng)
+    exposures = exposure_drift(times, drift, rng)
     val = np.arange(frames) % 4 == 2
     for split, chosen in (("train", ~val), ("val", val)):
         rows = chosen.nonzero()[0]
@@ -81,7 +86,7 @@ def pixel_errors(found: Sequence[Camera], capture: Capture) -> NDArray[np.float6
     After the world has been moved, turned and scaled, by a little, as fits best: splats would have
     come along.
     """
-    points = np.random.default_rng(0).uniform(-0.8, 0.8, (60, 3))
+    points = capture.points
     true = np.stack([_places(camera, points) for camera in capture.cameras])
     start = np.stack([_places(camera, points) for camera in found])
     slopes = []
@@ -113,10 +118,22 @@ def _on_path(time: float, size: int, aside: float = 0.0) -> Camera:
     return camera_on_dome(azimuth, 0.5 + 0.06 * math.sin(14 * time) + aside, size)
 
 
-def _pose_errors(
-    cameras: Sequence[Camera], pixels: float, times: NDArray[np.float64], rng: np.random.Generator
+def pose_errors(
+    cameras: Sequence[Camera],
+    pixels: float,
+    times: NDArray[np.float64],
+    rng: np.random.Generator,
+    points: NDArray[np.float64] = _ON_STAGE,
+    distance: float = CAMERA_RADIUS,
 ) -> NDArray[np.float64]:
-    """Return turns [rad] and shifts [world units] (F, 6) without a mean that displace so far."""
+    """Return turns [rad] and shifts [world units] (F, 6) without a mean that displace so far.
+
+    Args:
+        cameras, times: of the pictures, in their order.
+        pixels: by how much they displace ``points`` (P, 3), root mean square [px].
+        rng: of the errors.
+        distance: of the points from the cameras, about [world units].
+    """
     smooth = sum(
         rng.normal(size=6) * np.sin(2 * math.pi * k * times[:, None] + rng.uniform(0, 6.28, 6))
         for k in (1, 2)
@@ -124,16 +141,17 @@ def _pose_errors(
     rough = rng.normal(size=(len(times), 6))
     errors = sum(part / np.sqrt(np.square(part).mean()) for part in (smooth, rough))
     errors -= errors.mean(0)
-    errors[:, 3:] *= CAMERA_RADIUS
+    errors[:, 3:] *= distance
     unit = 1 / cameras[0].fx
     small = [corrected(c, unit * e) for c, e in zip(cameras, errors, strict=True)]
-    found = pixel_errors(small, Capture(cameras, small, np.ones((1, 3))))
+    found = pixel_errors(small, Capture(cameras, small, np.ones((1, 3)), points))
     return errors * unit * pixels / math.sqrt(np.square(found).mean())
 
 
-def _drift(
+def exposure_drift(
     times: NDArray[np.float64], most: float, rng: np.random.Generator
 ) -> NDArray[np.float64]:
+    """Return smooth factors (F, 3) on the colours, of mean 1, about ``most`` from it at most."""
     phases = rng.uniform(0, 6.28, 4)
     light = 0.7 * np.sin(2 * math.pi * 1.3 * times + phases[0])
     tint = 0.3 * np.sin(2 * math.pi * 0.8 * times[:, None] + phases[1:])
