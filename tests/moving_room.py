@@ -17,8 +17,8 @@ from pathlib import Path
 import numpy as np
 from datasets import write_picture
 from numpy.typing import NDArray
-from room import FOCAL, SIZE, look_at, looked_up, pattern
-from walking_capture import DIMMED, OFF_PATH, Capture, exposure_drift, pose_errors
+from room import FOCAL, SIZE, WALLS, look_at, looked_up, pattern
+from walking_capture import DIMMED, OFF_PATH, Capture, exposure_drift, opengl_pose, pose_errors
 
 from gsdmsr_cli.model.layers.cameras import corrected
 from gsdmsr_cli.scene.camera import Camera
@@ -33,7 +33,6 @@ TARGET = np.array([0.0, 1.4, -0.1])
 
 SEEN = np.random.default_rng(0).uniform([-1.5, 0.3, -1.0], [1.5, 2.2, 1.0], (60, 3))
 """Places that all cameras see, by which their errors are told [m]."""
-
 
 MOST = 2**14
 """Lookups at once, of which OpenCV bounds the number."""
@@ -83,9 +82,8 @@ class Thing:
     def surface(self, count: int, rng: np.random.Generator) -> Floats:
         """Return points (count, 3) of the unplaced surface."""
         points = rng.normal(size=(count, 3))
-        return (
-            points / (np.linalg.norm(points, axis=1) if self.round else abs(points).max(1))[:, None]
-        )
+        order = 2 if self.round else np.inf
+        return points / np.linalg.norm(points, ord=order, axis=1, keepdims=True)
 
 
 def _textures(seed: int, texels: int, tint: Sequence[float]) -> list[Floats]:
@@ -99,7 +97,7 @@ THINGS = {
 }
 """What moves."""
 
-WALLS = [pattern(side)[:128, :128] for side in range(6)]
+COARSE_WALLS = [wall[:128, :128] for wall in WALLS]
 
 
 def write_capture(
@@ -122,10 +120,11 @@ def write_capture(
     given = [corrected(camera, error) for camera, error in zip(true, wrong, strict=True)]
     exposures = exposure_drift(times, drift, rng)
     folder.mkdir(parents=True, exist_ok=True)
+    val = np.arange(frames) % 8 == 4
     written: dict[str, list[str]] = {"train": [], "val": [], "test": []}
     entries = []
     for i, time in enumerate(times):
-        split = "val" if i % 8 == 4 else "train"
+        split = "val" if val[i] else "train"
         opened = time + SHUTTER / (frames - 1) * np.array([-0.5, 0.0, 0.5])
         shots = [_shot(on_path(at, width), at) for at in opened.clip(0, 1)]
         picture = np.mean([shot[0] for shot in shots], axis=0) * exposures[i]
@@ -144,34 +143,43 @@ def write_capture(
     (folder / "transforms.json").write_text(json.dumps(document), encoding="utf-8")
     described = {"gsdmsr": 1, "bound": float(SIZE.max())}
     (folder / "scene.json").write_text(json.dumps(described), encoding="utf-8")
-    train = [i for i in range(frames) if i % 8 != 4]
+    train = (~val).nonzero()[0]
     known = [true[i] for i in train], [given[i] for i in train], exposures[train]
     return Capture(*known, points=SEEN)
 
 
-def seen_points(thing: Thing, time: float, count: int, width: int) -> Floats:
-    """Return points (P, 3) of the unplaced surface that the walking camera sees at a time."""
+def seen_points(thing: Thing, time: float, count: int) -> Floats:
+    """Return points (P, 3) of the unplaced surface that the walking camera may see at a time.
+
+    Of ``count`` that are drawn; some may lie beside its picture.
+    """
     points = thing.surface(count, np.random.default_rng(0))
-    camera = on_path(time, width)
-    rays = thing.at(points, time) - camera.centre
-    far = [other.meet(camera.centre, rays, time)[0] for other in THINGS.values()]
-    own = thing.meet(camera.centre, rays, time)[0]
+    centre, _ = _walk(time)
+    rays = thing.at(points, time) - centre
+    far = [other.meet(centre, rays, time)[0] for other in THINGS.values()]
+    own = thing.meet(centre, rays, time)[0]
     return points[(abs(own - 1) < 1e-6) & (np.min(far, axis=0) >= own)]
 
 
 def on_path(time: float, width: int, aside: float = 0.0) -> Camera:
     """Return the walking camera, turned up by ``aside`` [rad] about the middle of what it sees."""
-    along = 2 * time - 1
-    sway = 0.2 * math.sin(3 * along) + 0.03 * math.sin(40 * time)
-    centre = np.array([1.0 * along, -1.5 + 0.4 * along**2, sway])
+    centre, target = _walk(time)
     arm = centre - TARGET
     level = math.hypot(arm[0], arm[1])
     turned = math.atan2(arm[2], level) + aside
     reach = math.hypot(level, arm[2])
     arm = np.array([*arm[:2] / level * reach * math.cos(turned), reach * math.sin(turned)])
-    pose = np.linalg.inv(look_at(TARGET + arm, TARGET + np.array([0.5 * along, 0.0, 0.0])))
+    pose = np.linalg.inv(look_at(TARGET + arm, target))
     height = width * 3 // 4
     return Camera(pose, FOCAL * width, FOCAL * width, width / 2, height / 2, width, height)
+
+
+def _walk(time: float) -> tuple[Floats, Floats]:
+    """Return where the walking camera is, and what it looks at, each (3,)."""
+    along = 2 * time - 1
+    sway = 0.2 * math.sin(3 * along) + 0.03 * math.sin(40 * time)
+    centre = np.array([along, -1.5 + 0.4 * along**2, sway])
+    return centre, TARGET + np.array([0.5 * along, 0.0, 0.0])
 
 
 def _shot(camera: Camera, time: float) -> tuple[Floats, NDArray[np.bool_]]:
@@ -180,7 +188,7 @@ def _shot(camera: Camera, time: float) -> tuple[Floats, NDArray[np.bool_]]:
     local = [(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)]
     rays = np.stack(local, axis=-1).reshape(-1, 3) @ camera.rotation
     nearest, points = _out_of_room(camera.centre, rays)
-    colours = _on_cube(points, WALLS)
+    colours = _on_cube(points, COARSE_WALLS)
     moving = np.zeros(len(rays), bool)
     for thing in THINGS.values():
         far, points = thing.meet(camera.centre, rays, time)
@@ -238,6 +246,5 @@ def _write(folder: Path, name: str, picture: Floats, moving: NDArray[np.bool_]) 
 
 
 def _entry(name: str, time: float, camera: Camera) -> dict[str, object]:
-    pose = np.linalg.inv(camera.world_to_camera) @ np.diag([1.0, -1.0, -1.0, 1.0])
     paths = {"file_path": f"images/{name}", "motion_mask_path": f"masks/{name}"}
-    return {**paths, "time": float(time), "transform_matrix": pose.tolist()}
+    return {**paths, "time": float(time), "transform_matrix": opengl_pose(camera).tolist()}

@@ -33,7 +33,7 @@ def test_surfaces_are_seen_where_they_are(room: tuple[Path, Capture], name: str)
     view = read_scene(room[0]).split("test")[1]
     sharp, true = cv2.imread(str(view.signals["moving"]))[..., 0], on_path(view.time, 96)
     assert not np.allclose(view.camera.world_to_camera, true.world_to_camera, atol=0.1)
-    points = THINGS[name].at(seen_points(THINGS[name], view.time, 300, 96), view.time)
+    points = THINGS[name].at(seen_points(THINGS[name], view.time, 300), view.time)
     columns, rows = pixels(view.camera, points).T
     inside = (columns >= 0) & (columns < 96) & (rows >= 0) & (rows < 72)
     assert inside.sum() > 50
@@ -44,7 +44,7 @@ def test_surfaces_are_seen_where_they_are(room: tuple[Path, Capture], name: str)
 def test_points_of_a_surface_keep_their_colours(room: tuple[Path, Capture]) -> None:
     """Of the box, in test pictures: these are sharp and in mean colours."""
     box = THINGS["box"]
-    points = seen_points(box, 0.5, 400, 96)
+    points = seen_points(box, 0.5, 400)
     seen = []
     for view in read_scene(room[0]).split("test"):
         picture = cv2.GaussianBlur(cv2.imread(str(view.image_path)).astype(float), (0, 0), 0.7)

@@ -100,6 +100,12 @@ def pixel_errors(found: Sequence[Camera], capture: Capture) -> NDArray[np.float6
     return np.sqrt(squares)
 
 
+def opengl_pose(camera: Camera) -> NDArray[np.float64]:
+    """Return the camera-to-world matrix (4, 4) of axes x right, y up, z back, as in layouts."""
+    pose: NDArray[np.float64] = np.linalg.inv(camera.world_to_camera) @ np.diag([1, -1, -1, 1])
+    return pose
+
+
 def _moved(points: NDArray[np.float64], number: int, by: float) -> NDArray[np.float64]:
     """Return points (P, 3) shifted along (0 to 2), turned about (3 to 5) an axis, or scaled (6)."""
     if number == 6:
@@ -174,11 +180,11 @@ def _write(
     pictures: Sequence[NDArray[np.uint8]],
 ) -> None:
     frames = []
-    to_opengl = np.diag([1.0, -1.0, -1.0, 1.0])
     for i, (camera, time, picture) in enumerate(zip(cameras, times, pictures, strict=True)):
         write_picture(folder / split / f"{i:03d}.png", picture)
-        matrix = np.linalg.inv(camera.world_to_camera) @ to_opengl
         name = f"./{split}/{i:03d}"
-        frames.append({"file_path": name, "time": time, "transform_matrix": matrix.tolist()})
+        frames.append(
+            {"file_path": name, "time": time, "transform_matrix": opengl_pose(camera).tolist()}
+        )
     document = {"camera_angle_x": CAMERA_ANGLE_X, "frames": frames}
     (folder / f"transforms_{split}.json").write_text(json.dumps(document), encoding="utf-8")

@@ -9,21 +9,13 @@ import argparse
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
-from statistics import fmean
 
 import numpy as np
 import torch
+from measured_captures import camera_error, print_row, scores, trained
 from moving_room import THINGS, Floats, Thing, seen_points, write_capture
-from walking_capture import Capture, pixel_errors
 
-from gsdmsr_cli.evaluation.protocol import ViewRenderer, average, score_views
-from gsdmsr_cli.formats import read_scene
-from gsdmsr_cli.model.layers.cameras import Cameras
 from gsdmsr_cli.model.model import Model
-from gsdmsr_cli.options.preset import load_preset
-from gsdmsr_cli.raster import best_engine
-from gsdmsr_cli.scene.pictures import Pictures
-from gsdmsr_cli.training.trainer import Trainer
 
 OFF = "training.window=1", "losses.ssim_until=0.3", "density.until=0.5"
 """The preset as it was before it had a window in time."""
@@ -44,6 +36,8 @@ DEVICES: dict[str, Sequence[str]] = {
 }
 """Options by what a row of the table is called."""
 
+SMALL = "splats.count=4000", "density.cap=15000"
+
 REFERENCE, TIMES, POINTS, NEAREST = 0.5, 17, 400, 4
 """When points of surfaces are taken, at how many moments they are looked for, how many there are,
 and how many of the splats next to each tell where it goes."""
@@ -52,39 +46,10 @@ OPAQUE = 0.2
 """Opacity that a splat must have for that."""
 
 
-def trained(folder: Path, steps: int, seed: int, options: Sequence[str]) -> Trainer:
-    """Return a training that has ended."""
-    given = [
-        f"training.steps={steps}", f"training.seed={seed}", "training.threads=1",
-        "splats.count=4000", "density.cap=15000", *options,
-    ]  # fmt: skip
-    torch.set_num_threads(1)
-    pictures = Pictures((0.0, 0.0, 0.0), 1, 1 << 28)
-    preset = load_preset("video", None, given)
-    trainer = Trainer(read_scene(folder), preset, best_engine("cpu"), pictures)
-    for _ in range(steps):
-        trainer.step()
-    return trainer
-
-
-def scores(trainer: Trainer) -> list[float]:
-    """Return PSNR of the train and the val views, of the test views, and of what moves there."""
-    training = trainer.renderer
-    renderer = ViewRenderer(
-        trainer.result(), training.engine, training.pictures, training.background
-    )
-    found = []
-    for split in ("train", "val", "test"):
-        scored = score_views(renderer, trainer.scene.split(split), {}, lambda done: None)
-        means = average([one for _, one in scored])
-        found.append(means["psnr"] or 0.0)
-    return [*found, means["psnr_moving"] or 0.0]
-
-
 @torch.no_grad()
 def path_error(model: Model, thing: Thing) -> float:
     """Return how far points of a surface are from where they should be, in % of their paths."""
-    points = seen_points(thing, REFERENCE, POINTS, 160)
+    points = seen_points(thing, REFERENCE, POINTS)
     start = model.at(model.instant(REFERENCE)).splats
     opaque = (start.logit_opacities.sigmoid() > OPAQUE).numpy()
     places = start.means.numpy()[opaque]
@@ -99,15 +64,6 @@ def path_error(model: Model, thing: Thing) -> float:
     ways = np.linalg.norm(np.diff(true, axis=0), axis=2).sum(0)
     apart = np.linalg.norm(np.array(found) - np.array(true), axis=2).mean(0)
     return float(100 * (apart / ways).mean())
-
-
-def camera_error(trainer: Trainer, capture: Capture) -> float:
-    """Return the error of the cameras that the training ends with [px]."""
-    layer = trainer.result().layers.get("layers.cameras")
-    cameras = capture.given
-    if isinstance(layer, Cameras):
-        cameras = [layer.place(view.camera, view.time) for view in trainer.views]
-    return float(np.sqrt(np.square(pixel_errors(cameras, capture)).mean()))
 
 
 def main() -> None:
@@ -131,13 +87,13 @@ def main() -> None:
             with tempfile.TemporaryDirectory() as folder:
                 given = args.width, args.frames, args.pixels, args.drift, seed
                 capture = write_capture(Path(folder), *given)
-                trainer = trained(Path(folder), args.steps, seed, [*DEVICES[name], *args.set])
+                options = [*SMALL, *DEVICES[name], *args.set]
+                trainer = trained(Path(folder), "video", 0.0, args.steps, seed, options)
                 paths = [path_error(trainer.result(), thing) for thing in THINGS.values()]
-                lines.append((camera_error(trainer, capture), *paths, *scores(trainer)))
-        means = [fmean(column) for column in zip(*lines, strict=True)]
-        shown = " | ".join(f"{value:.2f}" for value in means)
-        each = ", ".join(f"{line[-1]:.2f}" for line in lines)
-        print(f"| {name} | {shown} ({each}) |", flush=True)
+                seen = [*scores(trainer, "train", "psnr"), *scores(trainer, "val", "psnr")]
+                aside = scores(trainer, "test", "psnr", "psnr_moving")
+                lines.append([camera_error(trainer, capture), *paths, *seen, *aside])
+        print_row([name], lines)
 
 
 if __name__ == "__main__":
