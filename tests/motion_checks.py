@@ -18,8 +18,8 @@ from gsdmsr_cli.model.model import MOTION, Model
 from gsdmsr_cli.options.preset import DensityOptions
 from gsdmsr_cli.training.population import Tick
 from gsdmsr_cli.training.population.density import Density
-from gsdmsr_cli.training.population.stillness import let_stand_still
 from gsdmsr_cli.training.resizing import resize_model
+from gsdmsr_cli.training.standing import let_stand_still
 from gsdmsr_cli.training.statistics import DensityStatistics
 
 FACTS = Facts(bound=1.3, box=((-1.3, -1.2, -1.1), (1.3, 1.4, 1.0)), frames=20)

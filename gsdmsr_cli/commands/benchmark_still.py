@@ -19,8 +19,9 @@ from gsdmsr_cli.ground import say
 from gsdmsr_cli.ground.errors import UsageError
 from gsdmsr_cli.model.model import Model
 from gsdmsr_cli.scene.scene import View
-from gsdmsr_cli.training.population.stillness import let_stand_still, motion_saliency
+from gsdmsr_cli.training.population.stillness import motion_saliency
 from gsdmsr_cli.training.resizing import resize_model
+from gsdmsr_cli.training.standing import let_stand_still
 
 SCHEMA = 1
 

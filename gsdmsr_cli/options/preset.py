@@ -176,12 +176,15 @@ class LossOptions:
     Attributes:
         ssim: weight w of (1 - w) L1 + w (1 - SSIM), 0 to 1.
         ssim_until: progress up to which the SSIM term counts; later w is 0.
+        inliers: share of a picture's pixels whose errors are taken to be normal; areas with larger
+            ones are left out, such as people who walk by; 1 leaves out nothing.
         terms: further terms, each a "name" and the options that its own file declares, see
             ``training.losses``.
     """
 
     ssim: float = 0.2
     ssim_until: float = 0.3
+    inliers: float = 1.0
     terms: tuple[dict[str, Any], ...] = ()
 
     def __post_init__(self) -> None:
@@ -189,6 +192,7 @@ class LossOptions:
         require(self, "terms", named, "a list of mappings, each with the name of a term")
         require(self, "ssim", 0.0 <= self.ssim <= 1.0, "a weight from 0 to 1")
         require_progress(self, "ssim_until")
+        require(self, "inliers", 0.0 < self.inliers <= 1.0, "a share above 0, up to 1")
 
 
 @dataclass(frozen=True)

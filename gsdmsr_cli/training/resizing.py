@@ -94,6 +94,8 @@ class Population:
         generator: source of random choices.
         engine, background: what draws, and the (3,) colour behind the splats.
         shots: returns up to so many cameras of train views and their times, chosen at random.
+        marked: returns up to so many cameras of train views that may be seen by now and have a mask
+            of what moves, their times, and those masks (H, W) bool, chosen at random.
         all_threads: a context in which kernels may use every thread.
         moving: whether the static phase is over.
         dropped: how many splats have been dropped because their values were not finite.
@@ -110,12 +112,13 @@ class Population:
         engine: Engine,
         background: Tensor,
         shots: Callable[[int], Sequence[tuple[Camera, float]]],
+        marked: Callable[[int], Sequence[tuple[Camera, float, Tensor]]],
         all_threads: Callable[[], AbstractContextManager[None]],
     ) -> None:
         self.model, self.optimizer, self.saliency = model, optimizer, saliency
         self.radius, self.cap, self.generator = radius, cap, generator
         self.engine, self.background, self.shots = engine, background, shots
-        self.all_threads = all_threads
+        self.marked, self.all_threads = marked, all_threads
         self.statistics = DensityStatistics(len(model.splats), model.splats.means.device)
         self.average = Average()
         self.moving = False

@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import islice
 
 import torch
 from torch import Tensor
@@ -19,6 +20,7 @@ from gsdmsr_cli.raster import Engine
 from gsdmsr_cli.runs.checkpoints import Checkpoint
 from gsdmsr_cli.scene.camera import Camera
 from gsdmsr_cli.scene.pictures import Pictures
+from gsdmsr_cli.scene.scene import MOVING as MOVES
 from gsdmsr_cli.scene.scene import Scene
 from gsdmsr_cli.training import averaging, snapshot
 from gsdmsr_cli.training.gating import gates_of, observe_step
@@ -123,8 +125,9 @@ class Trainer:
         given = self.optimizer, self.saliency, self.scene.radius, self.preset.density.cap
         drawing = self.renderer.engine, self.renderer.background
         return Population(
-            model, *given, self.generator, *drawing, self._shots, self.workers.all_threads
-        )
+            model, *given, self.generator, *drawing, self._shots, self._marked,
+            self.workers.all_threads,
+        )  # fmt: skip
 
     @property
     def model(self) -> Model:
@@ -344,6 +347,15 @@ class Trainer:
         chosen = torch.randperm(len(self.views), generator=self.generator)[:most]
         views = [self.views[row] for row in chosen.tolist()]
         return [(self.renderer.pictures.camera(view), view.time) for view in views]
+
+    def _marked(self, most: int) -> list[tuple[Camera, float, Tensor]]:
+        """Return up to so many train views that may be seen by now, with masks of what moves."""
+        progress, pictures = self.clock.progress, self.renderer.pictures
+        rows = torch.randperm(len(self.views), generator=self.generator).tolist()
+        views = [self.views[row] for row in rows if self.window.shows(row, progress)]
+        marked = ((view, pictures.signal(view, MOVES)) for view in views)
+        with_masks = ((view, mask) for view, mask in marked if mask is not None)
+        return [(pictures.camera(view), view.time, mask) for view, mask in islice(with_masks, most)]
 
     def result(self) -> Model:
         """Return the model that the training has led to: the average where there is one yet."""

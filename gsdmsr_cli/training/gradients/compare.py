@@ -14,6 +14,7 @@ from gsdmsr_cli.model.model import Model
 from gsdmsr_cli.ops.photometric import photometric_loss, tile_errors
 from gsdmsr_cli.raster import Comparing, ComparingViews, Comparison, Engine
 from gsdmsr_cli.scene.camera import Camera
+from gsdmsr_cli.training.gradients.inliers import inliers
 from gsdmsr_cli.training.gradients.phase import ViewGradients
 
 
@@ -33,6 +34,7 @@ def compare(
     sh_degree: int | None = None,
     tile_weights: Tensor | None = None,
     counted: Tensor | None = None,
+    normal: float = 1.0,
 ) -> ViewGradients:
     """Draw what a model is at a moment and compare the picture with a target.
 
@@ -45,13 +47,15 @@ def compare(
         tile_weights: (tiles,) factors on the share of each tile in the loss, or None for 1
             everywhere; only where SSIM has no weight.
         counted: (H, W) bool, pixels that have a part in the loss, or None for all.
+        normal: share of the pixels whose errors are taken to be normal, see ``inliers``.
     """
     given = moment, camera, background, target, ssim_weight, sh_degree, tile_weights
-    if counted is None and moment.features is None and isinstance(engine, Comparing):
+    whole = counted is None and normal == 1
+    if whole and moment.features is None and isinstance(engine, Comparing):
         found = engine.compare(*given)
     else:
         frame = engine.rasterize(moment, camera, background, sh_degree)
-        found = compare_frame(frame, target, ssim_weight, tile_weights, counted)
+        found = compare_frame(frame, target, ssim_weight, tile_weights, counted, normal)
     size = camera.width, camera.height
     gradients = gradients_of(found.loss, model)
     return ViewGradients(found.loss.detach(), gradients, found.on_screen, size, found.errors)
@@ -95,6 +99,7 @@ def draw_and_compare(
     sh_degree: int | None = None,
     tile_weights: Tensor | None = None,
     counted: Tensor | None = None,
+    normal: float = 1.0,
     with_depth: bool = False,
 ) -> tuple[Comparison, Frame]:
     """Draw a moment, let the model shade the frame, compare; return the frame as well.
@@ -103,7 +108,7 @@ def draw_and_compare(
     """
     frame = engine.rasterize(moment, camera, background, sh_degree, with_depth)
     frame = model.shade(frame, instant)
-    return compare_frame(frame, target, ssim_weight, tile_weights, counted), frame
+    return compare_frame(frame, target, ssim_weight, tile_weights, counted, normal), frame
 
 
 def compare_frame(
@@ -112,6 +117,7 @@ def compare_frame(
     ssim_weight: float,
     tile_weights: Tensor | None = None,
     counted: Tensor | None = None,
+    normal: float = 1.0,
 ) -> Comparison:
     """Return what ``Comparing.compare`` does, of a frame that has been drawn.
 
@@ -119,8 +125,9 @@ def compare_frame(
     """
     rgb = frame.rgb
     if counted is not None:
-        true = target.permute(1, 2, 0).to(rgb) / 255
-        rgb = torch.where(counted.to(rgb.device)[..., None], rgb, true)
+        rgb = _right_outside(counted, rgb, target)
+    if normal < 1:
+        rgb = _right_outside(inliers(rgb, target, normal), rgb, target)
     errors = None if ssim_weight > 0 else tile_errors(rgb, target)
     if errors is None or tile_weights is None:
         loss = unweighted = photometric_loss(rgb, target, ssim_weight)
@@ -130,3 +137,9 @@ def compare_frame(
         unweighted = errors.sum() / target.numel()
     (on_screen,) = torch.autograd.grad(unweighted, frame.means2d, retain_graph=True)
     return Comparison(loss, on_screen, None if errors is None else errors.detach())
+
+
+def _right_outside(counted: Tensor, rgb: Tensor, target: Tensor) -> Tensor:
+    """Return the picture with the true colours wherever a pixel (H, W) does not count."""
+    true = target.permute(1, 2, 0).to(rgb) / 255
+    return torch.where(counted.to(rgb.device)[..., None], rgb, true)

@@ -83,17 +83,18 @@ class TrainingRenderer:
         masks = [pictures.signal(view, MASK) for view in views]
         weights = [self._on_device(order.tile_weights) for order in orders]
         further = self._ssim_weight(phase.progress), self._sh_degree(phase.progress)
-        together = _alike(cameras, weights) and all(mask is None for mask in masks)
+        normal = self.preset.losses.inliers
+        whole = normal == 1 and all(mask is None for mask in masks)
+        together = whole and _alike(cameras, weights)
         moments: Iterable[Moment] = (self._seen(model, [one], phase)[0] for one in instants)
         if together and isinstance(self.engine, ComparingViews):
             moments = at_once = self._seen(model, instants, phase)
             if all(moment.features is None for moment in at_once):
                 given = self.engine, model, at_once, cameras, self.background, targets
                 return compare_views(*given, *further, weights)
+        drawn = self.engine, model
         return [
-            compare(
-                self.engine, model, moment, camera, self.background, target, *further, own, mask
-            )
+            compare(*drawn, moment, camera, self.background, target, *further, own, mask, normal)
             for moment, camera, target, own, mask in zip(
                 moments, cameras, targets, weights, masks, strict=True
             )
@@ -117,7 +118,7 @@ class TrainingRenderer:
             self.engine, model, traced, instant, camera, self.background, target,
             self._ssim_weight(phase.progress), self._sh_degree(phase.progress),
             self._on_device(order.tile_weights), pictures.signal(view, MASK),
-            any(term.needs_depth for term in self.terms),
+            self.preset.losses.inliers, any(term.needs_depth for term in self.terms),
         )  # fmt: skip
         loss = found.loss
         for term, weight, other in zip(self.terms, weights, others, strict=True):

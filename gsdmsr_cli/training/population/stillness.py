@@ -6,8 +6,7 @@ different moments, where the optimiser's signal is one of a step of the training
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -18,10 +17,13 @@ from gsdmsr_cli.model.model import Model
 from gsdmsr_cli.options.preset import Preset, SaliencyOptions
 from gsdmsr_cli.scene.camera import Camera
 from gsdmsr_cli.training.population import Event, Tick
-from gsdmsr_cli.training.resizing import Population, Resize, kept
-
-MOMENTS = 16
-"""Times, evenly spaced, at which splats are compared."""
+from gsdmsr_cli.training.resizing import Population, Resize
+from gsdmsr_cli.training.standing import (
+    let_stand_still,
+    mean_of_moments,
+    moments_of,
+    of_moving_layers,
+)
 
 
 @dataclass(frozen=True)
@@ -55,23 +57,6 @@ def start(options: Options, preset: Preset) -> Stillness:
     return Stillness(saliency, first, preset.training.average_from)
 
 
-def let_stand_still(model: Model, still: Tensor, where: Splats) -> Resize:
-    """Return the resize after which further splats stand still.
-
-    Args:
-        model: of N splats.
-        still: (N,) bool, those that are to stand still; ones that do already may be named.
-        where: N splats, whose values those take that begin to.
-    """
-    rows = torch.arange(len(still), device=still.device)
-    begin = still & (rows < model.moving)
-    splats = {
-        name: torch.where(begin.view(-1, *[1] * (tensor.dim() - 1)), getattr(where, name), tensor)
-        for name, tensor in model.splats.detach().tensors().items()
-    }
-    return replace(kept(rows), splats=Splats(**splats), still=still)
-
-
 @torch.no_grad()
 def motion_saliency(model: Model, camera: Camera | None = None) -> tuple[Tensor, Splats]:
     """Return how much each splat moves (N,), and the splats at the mean of their moments.
@@ -85,12 +70,11 @@ def motion_saliency(model: Model, camera: Camera | None = None) -> tuple[Tensor,
         model: of N splats.
         camera: that looks at all moments, for layers that want one.
     """
-    layers = {name: own for name, own in model.layers.items() if not own.concerns_still}
-    model = Model(model.splats, layers, model.moving, model.precision)
-    mean = _mean(model, camera)
+    model = of_moving_layers(model)
+    mean = mean_of_moments(model, camera)
     size = mean.log_scales.mean(dim=1).exp()
     saliency = mean.means.new_zeros(len(mean))
-    for moment in _moments(model, camera):
+    for moment in moments_of(model, camera):
         parts = (
             (moment.means - mean.means).norm(dim=1) / size,
             (moment.log_scales - mean.log_scales).abs().amax(dim=1),
@@ -100,23 +84,6 @@ def motion_saliency(model: Model, camera: Camera | None = None) -> tuple[Tensor,
         )
         saliency = torch.stack([saliency, *parts]).amax(dim=0)
     return saliency, mean
-
-
-def _moments(model: Model, camera: Camera | None) -> Iterator[Splats]:
-    """Return the splats at each of the moments, one after the other: together they are large."""
-    times = (i / (MOMENTS - 1) for i in range(MOMENTS))
-    return (model.at(model.instant(time, camera)).splats for time in times)
-
-
-def _mean(model: Model, camera: Camera | None) -> Splats:
-    """Return the mean of the moments, by what they are away from the first: what stays, stays."""
-    moments = _moments(model, camera)
-    first = next(moments)
-    ways = {name: torch.zeros_like(tensor) for name, tensor in first.tensors().items()}
-    for moment in moments:
-        for name, tensor in moment.tensors().items():
-            ways[name] += tensor - getattr(first, name)
-    return Splats(**{name: getattr(first, name) + way / MOMENTS for name, way in ways.items()})
 
 
 def _angle(first: Tensor, second: Tensor) -> Tensor:

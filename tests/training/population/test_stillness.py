@@ -17,7 +17,8 @@ from gsdmsr_cli.gaussians.moment import Moment
 from gsdmsr_cli.gaussians.splats import Splats
 from gsdmsr_cli.model.layer import Instant, Layer
 from gsdmsr_cli.model.model import Model
-from gsdmsr_cli.training.population.stillness import MOMENTS, motion_saliency
+from gsdmsr_cli.training.population.stillness import motion_saliency
+from gsdmsr_cli.training.standing import MOMENTS
 
 At = Callable[[Splats, float], Splats]
 
