@@ -17,6 +17,7 @@ MOMENTS = 16
 """Times, evenly spaced, at which splats are compared."""
 
 
+@torch.no_grad()
 def let_stand_still(model: Model, still: Tensor, where: Splats) -> Resize:
     """Return the resize after which further splats stand still.
 
@@ -46,6 +47,7 @@ def moments_of(model: Model, camera: Camera | None) -> Iterator[Splats]:
     return (model.at(model.instant(time, camera)).splats for time in times)
 
 
+@torch.no_grad()
 def mean_of_moments(model: Model, camera: Camera | None) -> Splats:
     """Return the mean of the moments, by what they are away from the first: what stays, stays."""
     moments = moments_of(model, camera)

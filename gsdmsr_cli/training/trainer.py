@@ -115,7 +115,8 @@ class Trainer:
         self.stopwatch = Stopwatch()
         self.queue: list[int] = []
         self.window = start_window(scene, pictures, background, preset.training)
-        self.notes = [*self.renderer.notes, *filter(None, [self.window.note])]
+        told = [self.window.note, *(event.begin(self.views) for event in self.events.values())]
+        self.notes = [*self.renderer.notes, *filter(None, told)]
         self._times = scene.train_times
         self.changing = False
         self._skipped = 0

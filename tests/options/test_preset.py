@@ -40,7 +40,7 @@ def test_the_presets_ship() -> None:
     names = {"default", "dnerf", "hexplane", "static", "4dgs", "gsdmsr", "gsdmsr-literal"}
     names |= {"video", "nerfies", "hypernerf", "n3v", "dynamic-object", "dual-domain"}
     names |= {"4d-covariance", "pvg", "spacetime", "spacetime-lite", "ex4dgs"}
-    names |= {"sc-gs", "speedy"}
+    names |= {"sc-gs", "speedy", "static-video"}
     names |= {"grid4d", "compact"}
     assert names <= set(preset_files.preset_names())
 

@@ -20,6 +20,7 @@ from gsdmsr_cli.model.model import Model
 OFF = "training.window=1", "losses.ssim_until=0.3", "density.until=0.5"
 """The preset as it was before it had a window in time."""
 
+EVENTS = "density, opacity_reset, thinning, stillness"
 CAMERAS, EXPOSURE = "{name: cameras}", "{name: exposure}"
 
 DEVICES: dict[str, Sequence[str]] = {
@@ -31,6 +32,7 @@ DEVICES: dict[str, Sequence[str]] = {
     "cameras": (*OFF, f"layers=[{CAMERAS}]"),
     "exposure": (*OFF, f"layers=[{EXPOSURE}]"),
     "control points": (*OFF, "motion={name: control_points}"),
+    "motion masks": (*OFF, f"events=[{EVENTS}, motion_masks]"),
     "`video`": (),
     "`video`, cameras, exposure": (f"layers=[{CAMERAS}, {EXPOSURE}]",),
 }

@@ -15,6 +15,7 @@ from gsdmsr_cli.ground import plugins
 from gsdmsr_cli.ground.errors import UsageError
 from gsdmsr_cli.model.layer import options_of
 from gsdmsr_cli.options.preset import Preset
+from gsdmsr_cli.scene.scene import View
 
 if TYPE_CHECKING:
     from gsdmsr_cli.training.resizing import Population, Resize
@@ -48,6 +49,10 @@ class Event(ABC):
         Values of splats may be changed in place. Which splats there are, and in which order, must
         not be: that is what is returned, and then done to everything that has rows of splats.
         """
+
+    def begin(self, views: Sequence[View]) -> str | None:
+        """Learn of the train views, once; return what the user is to know of it, or None."""
+        return None
 
     def state(self) -> dict[str, Any]:
         """Return what a resumed training needs of it, plain JSON."""

@@ -21,6 +21,7 @@ from gsdmsr_cli.options.preset import Preset
 from gsdmsr_cli.options.strict import require, require_progress
 from gsdmsr_cli.raster import Engine
 from gsdmsr_cli.scene.camera import Camera
+from gsdmsr_cli.scene.scene import MOVING, View
 from gsdmsr_cli.training.population import Event, Tick
 from gsdmsr_cli.training.resizing import Population, Resize
 from gsdmsr_cli.training.standing import let_stand_still, mean_of_moments, of_moving_layers
@@ -69,6 +70,15 @@ class MotionMasks(Event):
     def __init__(self, options: Options, first: float) -> None:
         self.options, self.first = options, first
         self.rounds = 0
+
+    def begin(self, views: Sequence[View]) -> str | None:
+        """Return what to do for masks where no view has one."""
+        if any(MOVING in view.signals for view in views):
+            return None
+        return (
+            "no train view has a mask of what moves, so everything may move: prepare --auto-mask "
+            "makes such masks, and what stands is then kept apart from what moves"
+        )
 
     def due(self, tick: Tick) -> bool:
         """Return whether the next round's turn has come."""

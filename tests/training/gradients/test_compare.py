@@ -17,6 +17,7 @@ from gsdmsr_cli.ops.photometric import photometric_loss_twin
 from gsdmsr_cli.raster import load_engine
 from gsdmsr_cli.scene.camera import Camera
 from gsdmsr_cli.training.gradients.compare import compare
+from gsdmsr_cli.training.gradients.inliers import inliers
 from gsdmsr_cli.training.gradients.phase import ViewGradients
 from gsdmsr_cli.training.trainer import Trainer
 
@@ -40,12 +41,13 @@ def compared(
     counted: Tensor | None,
     engine: str = "cpu",
     weights: Tensor | None = None,
+    normal: float = 1.0,
 ) -> ViewGradients:
     model: Model = trainer.model
     camera: Camera = trainer.renderer.pictures.camera(trainer.views[0])
     return compare(
         load_engine(engine), model, Moment(model.splats), camera, BACKGROUND, target, ssim, 1,
-        weights, counted,
+        weights, counted, normal,
     )  # fmt: skip
 
 
@@ -138,3 +140,17 @@ def test_if_nothing_counts_there_is_nothing_to_learn(trainer: Trainer) -> None:
     found = compared(trainer, target, 0.2, torch.zeros(target.shape[1:], dtype=torch.bool))
     assert found.loss.item() == pytest.approx(0, abs=1e-5)  # SSIM in float32
     assert all(not gradient.any() for gradient in gradients(found))
+
+
+@pytest.mark.parametrize("ssim", [0.0, 0.2])
+def test_areas_with_unusual_errors_do_not_count(trainer: Trainer, ssim: float) -> None:
+    """A patch of another colour, as of something that goes past, changes no gradient."""
+    target = trainer.renderer.pictures.load(trainer.views[0]).clone()
+    target[:, 8:40, 8:40] = 255 - target[:, 8:40, 8:40]
+    counted = inliers(drawn(trainer).rgb, target, 0.5)
+    assert not counted.all()
+    expected = compared(trainer, target, ssim, counted)
+    found = compared(trainer, target, ssim, None, normal=0.5)
+    assert found.loss == expected.loss < compared(trainer, target, ssim, None).loss
+    for one, other in zip(gradients(found), gradients(expected), strict=True):
+        assert torch.equal(one, other)

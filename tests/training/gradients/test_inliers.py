@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from seam_checks import assert_trains_the_same_in_all_ways
 from torch import Tensor
 
 from gsdmsr_cli.training.gradients.inliers import PATCH, STRIDE, inliers
@@ -69,3 +72,7 @@ def test_it_is_as_defined(seed: int, share: float, error: float) -> None:
     top, left = (int(torch.randint(side - 20, (), generator=generator)) for side in (70, 101))
     rgb[top : top + 40, left : left + 40] += error
     assert torch.equal(inliers(rgb, target, share), by_definition(rgb, target, share))
+
+
+def test_it_trains_with_workers_without_and_resumed(tiny_scene: Path, tmp_path: Path) -> None:
+    assert_trains_the_same_in_all_ways(tiny_scene, tmp_path, "losses.inliers=0.8")
