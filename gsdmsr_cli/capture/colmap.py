@@ -14,9 +14,11 @@ import sys
 import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+from gsdmsr_cli.capture.between import place_between
 from gsdmsr_cli.capture.child import REFUSED, receive_arguments, run_child
 from gsdmsr_cli.capture.failure import why_no_model
 from gsdmsr_cli.capture.features import read_features
@@ -208,6 +210,7 @@ def main() -> None:
         "match": match,
         "match_share": match_share,
         "map": map_frames,
+        "place": partial(place_between, on_progress=_print_progress),
     }
     try:
         jobs[job](**arguments)

@@ -6,7 +6,7 @@ import math
 import re
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -88,6 +88,12 @@ class Frames:
         """Time of every frame in [0, 1], over all that were chosen."""
         times = [frame.time for frame in self.taken]
         return [(time - times[0]) / (times[-1] - times[0]) for time in times]
+
+    def some(self, count: int) -> Frames:
+        """Return at most ``count`` of them, evenly in time."""
+        taken = tuple(choose(self.taken, count))
+        names = dict(zip(self.taken, self.names, strict=True))
+        return replace(self, names=tuple(names[frame] for frame in taken), taken=taken)
 
     @property
     def duration(self) -> float | None:

@@ -20,7 +20,7 @@ LONGEST = 640
 """Longer side at which flow is computed [px]."""
 
 NEIGHBOURS = (-4, -2, 2, 4)
-"""Each frame is compared with these, counted in frames."""
+"""Each frame is compared with these, counted in keyframes."""
 
 OFF = 1.5
 """What is so far from its epipolar line moves [px at ``LONGEST``]."""
@@ -33,7 +33,7 @@ SMALLEST = 0.002
 
 
 def write_found_masks(
-    folder: Path, frames: Frames, found: Reconstruction, on_progress: OnProgress
+    folder: Path, frames: Frames, found: Reconstruction, keyframes: int, on_progress: OnProgress
 ) -> None:
     """Write a mask for every frame, empty where it has no camera or nothing to be compared with.
 
@@ -41,6 +41,7 @@ def write_found_masks(
         folder: to write.
         frames: the chosen ones.
         found: cameras of a first pass.
+        keyframes: how many of them COLMAP has found.
         on_progress: called with how many are done, and of how many.
     """
     scale = min(1.0, LONGEST / max(frames.size))
@@ -49,9 +50,9 @@ def write_found_masks(
     pixels = np.stack(np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), axis=-1)
     lens = found.lens.resized(width, height)
     rays = rays_of(lens, pixels.reshape(-1, 2).astype(np.float32)).reshape(height, width, 2)
-    masks = {}
+    masks, spacing = {}, max(1, round(len(greys) / keyframes))
     for i, name in enumerate(found.names):
-        others = [i + step for step in NEIGHBOURS if 0 <= i + step < len(greys)]
+        others = [i + spacing * step for step in NEIGHBOURS if 0 <= i + spacing * step < len(greys)]
         votes = [
             _off_lines(greys[i], greys[j], rays, essential_matrix(found.poses[i], found.poses[j]))
             for j in others

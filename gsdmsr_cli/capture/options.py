@@ -10,13 +10,18 @@ CAMERA_MODELS = (
 )  # fmt: skip
 MATCHINGS = ("auto", "sequential", "exhaustive", "both")
 
+FRAMES_OF_RIG = 60
+"""Frames of each camera that are taken of a rig unless something else is asked for."""
+
 
 @dataclass(frozen=True)
 class Options:
     """How a capture becomes a scene; every value changes what is written.
 
     Attributes:
-        frames: most frames to take, of each camera.
+        frames: most frames to take, of each camera of a rig.
+        keyframes: most of them from which COLMAP finds cameras and points; the others are placed
+            between these. Of no account for a rig.
         offsets: seconds by which the clocks of a rig's cameras are ahead, by name.
         max_side: longer side of the pictures, which are shrunk to it [px].
         features: most features of a frame.
@@ -31,7 +36,8 @@ class Options:
         seed: of COLMAP's random choices.
     """
 
-    frames: int = 60
+    frames: int = 240
+    keyframes: int = 60
     offsets: Mapping[str, float] = field(default_factory=dict)
     max_side: int = 1600
     features: int = 2048

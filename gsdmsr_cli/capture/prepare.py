@@ -12,6 +12,7 @@ import numpy as np
 
 from gsdmsr_cli.capture import write
 from gsdmsr_cli.capture.child import run_child
+from gsdmsr_cli.capture.colmap import LARGEST
 from gsdmsr_cli.capture.consistency import moving_share, turning_share
 from gsdmsr_cli.capture.convert import write_converted
 from gsdmsr_cli.capture.features import write_features
@@ -22,7 +23,7 @@ from gsdmsr_cli.capture.normalize import normalize
 from gsdmsr_cli.capture.options import Options
 from gsdmsr_cli.capture.pairs import choose_pairs
 from gsdmsr_cli.capture.quality import assess
-from gsdmsr_cli.capture.reconstruction import Reconstruction, read_reconstruction
+from gsdmsr_cli.capture.reconstruction import Reconstruction, read_reconstruction, with_placed
 from gsdmsr_cli.capture.report import write_page
 from gsdmsr_cli.capture.rig import Rig, read_rig, write_rig
 from gsdmsr_cli.capture.source import Source
@@ -49,6 +50,21 @@ class Masks:
     inverted: bool = False
 
 
+@dataclass(frozen=True, eq=False)
+class Cameras:
+    """What has been found of the cameras.
+
+    Attributes:
+        matches: folder of COLMAP's database of the keyframes.
+        of_keyframes: their cameras, and the points.
+        found: cameras of all frames.
+    """
+
+    matches: Path
+    of_keyframes: Reconstruction
+    found: Reconstruction
+
+
 def prepare(
     source: Source,
     masks: Masks | None,
@@ -69,15 +85,17 @@ def prepare(
         turned = "drop --invert-masks" if masks.inverted else "--invert-masks takes black for it"
         require_room(moving, frames, f"is it white that moves? {turned}")
     elif options.auto_mask:
-        _, first = pipeline.find_cameras(frames, features, None)
+        first = pipeline.find_cameras(frames, features, None)
         moving, masked_by = pipeline.find_masks(frames, first), "found"
         require_room(
             moving, frames, "the first cameras are wrong: drop --auto-mask or give --masks"
         )
-    matches, found = pipeline.find_cameras(frames, features, moving)
+    cameras = pipeline.find_cameras(frames, features, moving)
+    found = cameras.found
     require_registered(frames, found, options.min_registered)
     with show_progress("judging the cameras"):
-        shares = moving_share(matches, found), turning_share(matches, found.lens)
+        matches = cameras.matches
+        shares = moving_share(matches, cameras.of_keyframes), turning_share(matches, found.lens)
         quality = assess(frames, found, *shares, masked_by, moving)
     provenance = {
         "input": {"name": source.root.name, "kind": source.kind, "sha256": pipeline.key["source"]},
@@ -187,19 +205,40 @@ class _Pipeline:
 
         return self.run("masks", take, masks=digest(masks.folder, masks.inverted))
 
-    def find_masks(self, frames: Frames, first: Reconstruction) -> Path:
+    def find_masks(self, frames: Frames, first: Cameras) -> Path:
         """Return the folder of masks of what disagrees with the cameras of a first pass."""
 
         def find(folder: Path) -> None:
             with self.show_progress("finding what moves") as on_progress:
-                write_found_masks(folder, frames, first, on_progress)
+                keyframes = len(first.of_keyframes.names)
+                write_found_masks(folder, frames, first.found, keyframes, on_progress)
 
         return self.run("masks", find, masks="found")
 
-    def find_cameras(
-        self, frames: Frames, features: Path, masks: Path | None
-    ) -> tuple[Path, Reconstruction]:
-        """Return the folder of the matches and the cameras found from them."""
+    def find_cameras(self, frames: Frames, features: Path, masks: Path | None) -> Cameras:
+        """Return the cameras of keyframes, and of all other frames by what these have found."""
+        options = self.options
+        keyframes = frames if self.rig else frames.some(options.keyframes)
+        self.key["keyframes"] = len(keyframes.names)
+        matches, model = self._map(keyframes, features, masks)
+        of_keyframes = read_reconstruction(model)
+        if len(keyframes.names) == len(frames.names):
+            return Cameras(matches, of_keyframes, of_keyframes)
+
+        def place(folder: Path) -> None:
+            with self.show_progress("finding cameras between") as on_progress:
+                arguments = {
+                    "out": str(folder), "largest": str(model / LARGEST), "names": frames.names,
+                    "features": str(features), "masks": None if masks is None else str(masks),
+                    "seed": options.seed,
+                }  # fmt: skip
+                run_child("place", arguments, on_progress)
+
+        placed = self.run("between", place)
+        return Cameras(matches, of_keyframes, with_placed(of_keyframes, placed))
+
+    def _map(self, frames: Frames, features: Path, masks: Path | None) -> tuple[Path, Path]:
+        """Return the folders of the matches of frames and of the model that is found from them."""
         options = self.options
 
         def match(folder: Path) -> None:
@@ -226,7 +265,7 @@ class _Pipeline:
             "matches", match, camera_model=options.camera_model, matching=options.matching,
             seed=options.seed,
         )  # fmt: skip
-        return matches, read_reconstruction(self.run("model", find, mapping=options.mapping))
+        return matches, self.run("model", find, mapping=options.mapping)
 
 
 def require_registered(frames: Frames, found: Reconstruction, least: float) -> None:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from gsdmsr_cli.capture.between import PLACED
 from gsdmsr_cli.capture.colmap import LARGEST, PARTS
 from gsdmsr_cli.ground.files import read_json
 from gsdmsr_cli.scene.lens import Lens
@@ -75,6 +76,23 @@ def read_reconstruction(folder: Path) -> Reconstruction:
         seen=tuple(_seen(image, places) for image in images),
         parts=tuple(tuple(part) for part in read_json(folder / PARTS)["parts"]),
     )
+
+
+def with_placed(found: Reconstruction, folder: Path) -> Reconstruction:
+    """Return a reconstruction with the cameras that ``place_between`` has written beside its own.
+
+    Points, their errors and the number of frames that each was found in stay those of keyframes.
+    """
+    with np.load(folder / PLACED) as arrays:
+        names = [str(name) for name in arrays["names"]]
+        poses, ends = arrays["poses"], np.cumsum(arrays["counts"])[:-1]
+        seen = np.split(arrays["points"], ends) if names else []
+    both = sorted(
+        zip((*found.names, *names), (*found.poses, *poses), (*found.seen, *seen), strict=True),
+        key=lambda one: one[0],
+    )
+    ordered, all_poses, all_seen = zip(*both, strict=True)
+    return replace(found, names=ordered, poses=np.stack(all_poses), seen=all_seen)
 
 
 def _pose(image: Any) -> Floats:

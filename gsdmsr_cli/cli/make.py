@@ -33,7 +33,7 @@ def make(
     set_: Annotated[
         list[str] | None, typer.Option("--set", metavar="a.b=v", help="One option; repeatable.")
     ] = None,
-    frames: Annotated[int, typer.Option(min=8, metavar="N", help="Most frames to take.")] = 60,
+    frames: Annotated[int, typer.Option(min=8, metavar="N", help="Most frames to take.")] = 240,
     max_side: Annotated[
         int, typer.Option(min=64, metavar="N", help="Longer side of the pictures [px].")
     ] = 1600,

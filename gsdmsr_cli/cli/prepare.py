@@ -31,7 +31,14 @@ def prepare(
         list[str] | None,
         typer.Option(metavar="CAMERA=S", help="Seconds its clock is ahead; repeatable."),
     ] = None,
-    frames: Annotated[int, typer.Option(min=8, metavar="N", help="Most frames to take.")] = 60,
+    frames: Annotated[
+        int | None,
+        typer.Option(min=8, metavar="N", help="Most frames to take; 240, with --rig 60."),
+    ] = None,
+    keyframes: Annotated[
+        int,
+        typer.Option(min=8, metavar="N", help="Most frames that COLMAP finds cameras of."),
+    ] = 60,
     max_side: Annotated[
         int, typer.Option(min=64, metavar="N", help="Longer side of the pictures [px].")
     ] = 1600,
@@ -73,7 +80,7 @@ def prepare(
     ] = False,
 ) -> None:
     """Turn a video or pictures into a scene with cameras."""
-    from gsdmsr_cli.capture.options import CAMERA_MODELS, Options
+    from gsdmsr_cli.capture.options import CAMERA_MODELS, FRAMES_OF_RIG, Options
 
     if masks is not None and auto_mask:
         raise UsageError("--masks and --auto-mask are both given; drop one")
@@ -88,7 +95,8 @@ def prepare(
     if camera_model not in CAMERA_MODELS:
         raise UsageError(f"--camera-model {camera_model}: {nearest(camera_model, CAMERA_MODELS)}")
     options = Options(
-        frames=frames,
+        frames=frames or (FRAMES_OF_RIG if rig else Options.frames),
+        keyframes=keyframes,
         offsets=parse_offsets(offset or []),
         max_side=max_side,
         features=features,

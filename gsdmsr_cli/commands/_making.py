@@ -33,7 +33,7 @@ class Request:
     budget: str = "10m"
     preset: str | None = None
     overrides: tuple[str, ...] = ()
-    frames: int = 60
+    frames: int = 240
     max_side: int = 1600
     device: str = "auto"
 

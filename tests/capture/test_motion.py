@@ -59,7 +59,8 @@ def test_pixels_are_looked_at_from_their_centres_in_the_size_they_have(
     told: list[tuple[int, int]] = []
     out = tmp_path / "masks"
     out.mkdir()
-    motion.write_found_masks(out, frames, found, lambda done, total: told.append((done, total)))
+    given = out, frames, found, len(found.names)
+    motion.write_found_masks(*given, lambda done, total: told.append((done, total)))
     ((lens, pixels),) = asked
     width, height = (WIDTH, HEIGHT) if longest > WIDTH else (WIDTH // 2, HEIGHT // 2)
     assert (lens.width, lens.height, lens.cx, lens.cy) == (width, height, width / 2, height / 2)

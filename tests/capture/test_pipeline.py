@@ -14,7 +14,7 @@ from gsdmsr_cli.capture import prepare
 from gsdmsr_cli.capture.options import Options
 from gsdmsr_cli.capture.prepare import _Pipeline
 
-STAGES = ("frames", "features", "matches", "model")
+STAGES = ("frames", "features", "matches", "model", "between")
 
 CHANGES: dict[str, tuple[Any, str]] = {
     "frames": (33, "frames"),
@@ -23,6 +23,7 @@ CHANGES: dict[str, tuple[Any, str]] = {
     "features": (3333, "features"),
     "camera_model": ("OPENCV", "matches"),
     "matching": ("exhaustive", "matches"),
+    "keyframes": (33, "matches"),
     "seed": (3, "matches"),
     "mapping": ("incremental", "model"),
 }
@@ -40,9 +41,15 @@ class Asked:
         return Path(name)
 
 
+def frames_of(count: int) -> Any:
+    """Frames of which fewer may be chosen."""
+    return SimpleNamespace(names=("a.png",) * count, some=frames_of)
+
+
 def keys_with(options: Options, monkeypatch: pytest.MonkeyPatch) -> dict[str, dict[str, Any]]:
-    monkeypatch.setattr(prepare, "read_frames", lambda folder: SimpleNamespace())
+    monkeypatch.setattr(prepare, "read_frames", lambda folder: frames_of(240))
     monkeypatch.setattr(prepare, "read_reconstruction", lambda folder: None)
+    monkeypatch.setattr(prepare, "with_placed", lambda found, folder: None)
     monkeypatch.setattr(prepare, "versions", lambda: {"colmap": "1"})
     asked: Any = Asked()
     source: Any = SimpleNamespace(kind="video", digest=lambda: "abc")
