@@ -1,6 +1,7 @@
 """Every option of a training run, as frozen dataclasses per topic, and how a preset is loaded.
 
-Schedules are functions of progress in [0, 1]: step / steps or, with a budget, elapsed / budget.
+Schedules are functions of progress in [0, 1]: step / steps or, with a budget, elapsed / budget, to
+the power of ``budget_power``.
 """
 
 from __future__ import annotations
@@ -109,6 +110,9 @@ class TrainingOptions:
     Attributes:
         steps: length of the training [steps], unless there is a budget.
         budget: length of the training as wall time, such as "8m"; null counts steps.
+        budget_power: power of the share of the budget that progress is. Steps take longer and
+            longer as splats grow: below 1 the early phases, whose steps are fast, have less of the
+            time, as they have where steps count.
         static_until: progress up to which nothing moves.
         static_steps: most steps for which nothing moves.
         views_per_step: pictures drawn and compared per step, 1 to 16.
@@ -135,6 +139,7 @@ class TrainingOptions:
 
     steps: int = 10000
     budget: str | None = None
+    budget_power: float = 1.0
     static_until: float = 0.04
     static_steps: int = 300
     views_per_step: int = 2
@@ -159,6 +164,7 @@ class TrainingOptions:
         require(self, "views_per_step", within, f"1 to {MOST_VIEWS}")
         known = self.budget is None or _duration(self.budget) is not None
         require(self, "budget", known, f"null or {_DURATION}")
+        require(self, "budget_power", 0.1 <= self.budget_power <= 10, "0.1 to 10")
         require_progress(self, "static_until", "low_resolution_until", "average_from")
         require_progress(self, "window_until")
         require(self, "window", 0 < self.window <= 1, "a share above 0, up to 1")

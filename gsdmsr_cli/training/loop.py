@@ -17,6 +17,7 @@ from torch import Tensor
 
 from gsdmsr_cli.evaluation.metrics import PSNR_CAP, psnr, quantize
 from gsdmsr_cli.evaluation.protocol import ViewRenderer
+from gsdmsr_cli.ground.progress import time_left
 from gsdmsr_cli.runs.run import Run
 from gsdmsr_cli.scene.scene import Scene, View
 from gsdmsr_cli.training.keeping import Keeper
@@ -46,6 +47,7 @@ class Report:
         psnr: of the watched view, rounded to 8 bits [dB], or None if it is not a number.
         split: which split that view belongs to, "val" or, in scenes without, "train".
         timings: seconds since the last report by what they went into, see ``TIMINGS``.
+        power: of the share of the time that progress is, see ``schedule.Clock``.
     """
 
     step: int
@@ -60,11 +62,12 @@ class Report:
     psnr: float | None
     split: str
     timings: Mapping[str, float]
+    power: float = 1.0
 
     @property
     def remaining(self) -> float:
         """Wall time that is left at the pace so far [s]."""
-        return self.elapsed * (1 - self.progress) / max(self.progress, 1e-9)
+        return time_left(self.elapsed, self.progress, self.power)
 
     @property
     def place(self) -> str:
@@ -260,6 +263,7 @@ class Interval:
             psnr=self._psnr(),
             split=self.view.split,
             timings=self.trainer.stopwatch.take(),
+            power=clock.power,
         )
         self.begin()
         return report

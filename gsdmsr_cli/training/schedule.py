@@ -22,6 +22,7 @@ class Clock:
     Attributes:
         steps: length of the training [steps].
         budget: length of the training [s], or None.
+        power: of the share of the budget that progress is.
         step: steps made.
         before: wall time of earlier sessions [s].
         told: wall time of training by the clock of the first rank, where several processes go by
@@ -30,6 +31,7 @@ class Clock:
 
     steps: int
     budget: float | None
+    power: float = 1.0
     step: int = 0
     before: float = 0.0
     told: float | None = None
@@ -55,7 +57,7 @@ class Clock:
     def progress(self) -> float:
         """How far the training is, in [0, 1]."""
         if self.budget is not None:
-            return min(self.elapsed / self.budget, 1.0)
+            return math.pow(min(self.elapsed / self.budget, 1.0), self.power)
         return min(self.step / self.steps, 1.0)
 
     @property
@@ -67,4 +69,4 @@ class Clock:
 def new_clock(options: TrainingOptions) -> Clock:
     """Return the clock of a training that has not begun."""
     budget = None if options.budget is None else parse_duration(options.budget)
-    return Clock(options.steps, budget)
+    return Clock(options.steps, budget, 1.0 if budget is None else options.budget_power)

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from gsdmsr_cli.ground.errors import DataError
+from gsdmsr_cli.ground.progress import time_left
 from gsdmsr_cli.moving.container import WRONG, from_bytes
 from gsdmsr_cli.moving.decoding import decoded
 from gsdmsr_cli.moving.playing import model_of
@@ -100,7 +101,7 @@ class Showing:
             "running": running,
             "progress": progress,
             "elapsed": elapsed,
-            "remaining": elapsed * (1 - progress) / max(progress, 1e-9) if running else None,
+            "remaining": _time_left(run, elapsed, progress) if running else None,
             "step": last.get("step"),
             "splats": last.get("splats"),
             "curve": _curve(log),
@@ -156,3 +157,9 @@ def _changed(path: Path) -> float:
 
 def _version(data: bytes) -> str:
     return hashlib.blake2b(data, digest_size=12).hexdigest()
+
+
+def _time_left(run: Run, elapsed: float, progress: float) -> float:
+    """Return the wall time that is left of a training [s]."""
+    length = run.preset.training
+    return time_left(elapsed, progress, 1.0 if length.budget is None else length.budget_power)

@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from gsdmsr_cli.ground.progress import time_left
 from gsdmsr_cli.options.preset import TrainingOptions
 from gsdmsr_cli.training import schedule
 from gsdmsr_cli.training.schedule import Clock, log_linear, new_clock
@@ -78,6 +79,26 @@ def test_progress_counts_wall_time_with_a_budget(time: Time, budget: str, second
     time.now += seconds
     assert clock.progress == 1.0
     assert clock.elapsed == pytest.approx(1.25 * seconds)
+
+
+def test_early_phases_have_less_of_the_time_with_a_power_below_1(time: Time) -> None:
+    clock = new_clock(TrainingOptions(budget="100s", budget_power=0.5))
+    clock.start()
+    for seconds, progress in ((4, 0.2), (21, 0.5), (56, 0.9), (19, 1.0), (100, 1.0)):
+        time.now += seconds
+        assert clock.progress == pytest.approx(progress)
+    without = new_clock(TrainingOptions(steps=8, budget_power=0.5))
+    without.step = 2
+    assert without.progress == 0.25 and without.power == 1.0
+
+
+@pytest.mark.parametrize("power", [0.4, 1.0, 2.0])
+def test_what_is_left_of_a_budget_does_not_depend_on_the_power(time: Time, power: float) -> None:
+    clock = new_clock(TrainingOptions(budget="100s", budget_power=power))
+    clock.start()
+    time.now += 30
+    assert time_left(clock.elapsed, clock.progress, clock.power) == pytest.approx(70)
+    assert time_left(0.0, 0.0, power) == 0.0
 
 
 def test_time_of_earlier_sessions_counts(time: Time) -> None:
