@@ -92,7 +92,7 @@ def test_of_a_film_a_scene_is_prepared_first(tmp_path: Path) -> None:
     ("change", "message"),
     [
         ({"preset": "hexplane"}, "was made with preset = None, not 'hexplane'"),
-        ({"frames": 9}, "was made with frames = 60, not 9"),
+        ({"frames": 9}, "was made with frames = 240, not 9"),
         ({"overrides": ("density.cap=9",)}, "was made with set = "),
     ],
 )
