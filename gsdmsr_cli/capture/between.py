@@ -1,7 +1,7 @@
 """Finds cameras of the frames between keyframes, from the points that these have in common.
 
-What moves is seen well only at many moments, but a few dozen cameras say as much of what stands
-still as hundreds do. So COLMAP finds those of keyframes, and every other frame is placed by itself:
+What moves is seen well only at many moments, but a few dozen cameras do for what stands still.
+So COLMAP finds those of keyframes, and every other frame is placed by itself:
 its features are compared with those of the keyframes beside it of which the places in space are
 known, and the camera follows from these (LO-RANSAC, then least squares with a robust loss).
 """
@@ -17,8 +17,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gsdmsr_cli.capture.features import Features, read_features
-from gsdmsr_cli.capture.masks import read_mask, standing
+from gsdmsr_cli.capture.features import Features
+from gsdmsr_cli.capture.masks import standing_features
+from gsdmsr_cli.capture.model import point_places, point_rows, pose_of
 from gsdmsr_cli.ground.limits import cores
 from gsdmsr_cli.scene.native import load_pycolmap
 
@@ -84,23 +85,18 @@ def place_between(
     """
     model = load_pycolmap().Reconstruction(largest)
     (camera,) = model.cameras.values()
-    rows = {identifier: row for row, identifier in enumerate(sorted(model.points3D))}
-    places = np.array([model.points3D[i].xyz for i in rows]).reshape(-1, 3)
-
-    def features_of(name: str) -> Features:
-        found = read_features(Path(features), name)
-        return found if masks is None else standing(found, read_mask(Path(masks) / name))
-
+    rows, places = point_rows(model), point_places(model)
+    folders = Path(features), None if masks is None else Path(masks)
     images = {model.images[i].name: model.images[i] for i in model.reg_image_ids()}
     keyframes = [
-        _keyframe(place, features_of(name), images[name], rows)
+        _keyframe(place, standing_features(*folders, name), images[name], rows)
         for place, name in enumerate(names)
         if name in images
     ]
     wanted = [place for place, name in enumerate(names) if name not in images]
 
     def work(place: int) -> _Placed | None:
-        own = features_of(names[place])
+        own = standing_features(*folders, names[place])
         ordered = sorted(keyframes, key=lambda key: (abs(key.place - place), key.place))
         placed = _placed(own, ordered[:BESIDE], places, camera, seed)
         return placed or _placed(own, ordered, places, camera, seed)
@@ -157,9 +153,8 @@ def _placed(
     )
     if result is None or result["num_inliers"] < LEAST:
         return None
-    pose = np.eye(4)
-    pose[:3] = result["cam_from_world"].matrix()
-    return _Placed(pose, np.unique(points[np.asarray(result["inlier_mask"], np.bool_)]))
+    inliers = np.asarray(result["inlier_mask"], np.bool_)
+    return _Placed(pose_of(result["cam_from_world"]), np.unique(points[inliers]))
 
 
 def matched(

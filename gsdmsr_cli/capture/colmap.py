@@ -21,8 +21,7 @@ from typing import Any
 from gsdmsr_cli.capture.between import place_between
 from gsdmsr_cli.capture.child import REFUSED, receive_arguments, run_child
 from gsdmsr_cli.capture.failure import why_no_model
-from gsdmsr_cli.capture.features import read_features
-from gsdmsr_cli.capture.masks import read_mask, standing
+from gsdmsr_cli.capture.masks import standing_features
 from gsdmsr_cli.ground.errors import DataError, GsdmsrError
 from gsdmsr_cli.ground.files import write_json
 from gsdmsr_cli.ground.limits import cores
@@ -131,9 +130,8 @@ def _write_features(
 ) -> None:
     with colmap.Database.open(database) as opened:
         for image in opened.read_all_images():
-            found = read_features(Path(folder), image.name)
-            if masks is not None:
-                found = standing(found, read_mask(Path(masks) / image.name))
+            where = Path(folder), None if masks is None else Path(masks)
+            found = standing_features(*where, image.name)
             kind = colmap.FeatureExtractorType.SIFT
             described = colmap.FeatureDescriptors(type=kind, data=found.descriptors)
             opened.write_keypoints(image.image_id, found.pixels)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from gsdmsr_cli.capture.candidates import Candidate
 from gsdmsr_cli.capture.exif import read_exif, upright
-from gsdmsr_cli.capture.features import Features
+from gsdmsr_cli.capture.features import Features, read_features
 from gsdmsr_cli.capture.frames import Frames
 from gsdmsr_cli.capture.source import PICTURES, Source
 from gsdmsr_cli.ground.errors import DataError
@@ -161,3 +161,17 @@ def standing(features: Features, moving: Mask) -> Features:
     columns = features.pixels[:, 0].astype(np.int64).clip(0, width - 1)
     rows = features.pixels[:, 1].astype(np.int64).clip(0, height - 1)
     return features.where(np.asarray(grown)[rows, columns] == 0)
+
+
+def standing_features(features: Path, masks: Path | None, name: str) -> Features:
+    """Return the features of the frame ``name``, of those on what moves none.
+
+    COLMAP's database has these, in this order, and so do the images of its models.
+
+    Args:
+        features: folder of the frames' features.
+        masks: folder of their masks, None if nothing moves.
+        name: of the frame's file.
+    """
+    found = read_features(features, name)
+    return found if masks is None else standing(found, read_mask(masks / name))

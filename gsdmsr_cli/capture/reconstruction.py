@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from gsdmsr_cli.capture.between import PLACED
 from gsdmsr_cli.capture.colmap import LARGEST, PARTS
+from gsdmsr_cli.capture.model import point_places, point_rows, pose_of
 from gsdmsr_cli.ground.files import read_json
 from gsdmsr_cli.scene.lens import Lens
 from gsdmsr_cli.scene.native import load_pycolmap
@@ -61,19 +62,18 @@ def read_reconstruction(folder: Path) -> Reconstruction:
     """Return the model that ``capture.colmap.map_frames`` has written to ``folder``."""
     model = load_pycolmap().Reconstruction(str(folder / LARGEST))
     images = sorted((model.images[i] for i in model.reg_image_ids()), key=lambda i: i.name)
-    identifiers = sorted(model.points3D)
-    places = {identifier: row for row, identifier in enumerate(identifiers)}
-    points = [model.points3D[i] for i in identifiers]
+    rows = point_rows(model)
+    points = [model.points3D[i] for i in rows]
     (camera,) = model.cameras.values()
     return Reconstruction(
         lens=lens_of(camera.model_name, camera.params, camera.width, camera.height),
         names=tuple(image.name for image in images),
-        poses=np.stack([_pose(image) for image in images]),
-        points=np.array([point.xyz for point in points]).reshape(-1, 3),
+        poses=np.stack([pose_of(image.cam_from_world()) for image in images]),
+        points=point_places(model),
         colours=np.array([point.color for point in points], np.uint8).reshape(-1, 3),
         errors=np.array([point.error for point in points], np.float64),
         tracks=np.array([point.track.length() for point in points], np.int64),
-        seen=tuple(_seen(image, places) for image in images),
+        seen=tuple(_seen(image, rows) for image in images),
         parts=tuple(tuple(part) for part in read_json(folder / PARTS)["parts"]),
     )
 
@@ -95,14 +95,8 @@ def with_placed(found: Reconstruction, folder: Path) -> Reconstruction:
     return replace(found, names=ordered, poses=np.stack(all_poses), seen=all_seen)
 
 
-def _pose(image: Any) -> Floats:
-    pose = np.eye(4)
-    pose[:3] = image.cam_from_world().matrix()
-    return pose
-
-
-def _seen(image: Any, places: dict[int, int]) -> NDArray[np.int64]:
-    found = {places[point.point3D_id] for point in image.get_observation_points2D()}
+def _seen(image: Any, rows: dict[int, int]) -> NDArray[np.int64]:
+    found = {rows[point.point3D_id] for point in image.get_observation_points2D()}
     return np.array(sorted(found), np.int64)
 
 

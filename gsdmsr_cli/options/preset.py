@@ -174,6 +174,11 @@ class TrainingOptions:
         require(self, "seed", 0 <= self.seed < 2**32, "0 to 4294967295")
         _require_at_least(self, 0, "static_steps", "threads", "tiles_per_view")
 
+    @property
+    def progress_power(self) -> float:
+        """Power of the share of the length that progress is: of steps always 1."""
+        return 1.0 if self.budget is None else self.budget_power
+
 
 @dataclass(frozen=True)
 class LossOptions:

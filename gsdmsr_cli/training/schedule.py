@@ -69,4 +69,4 @@ class Clock:
 def new_clock(options: TrainingOptions) -> Clock:
     """Return the clock of a training that has not begun."""
     budget = None if options.budget is None else parse_duration(options.budget)
-    return Clock(options.steps, budget, 1.0 if budget is None else options.budget_power)
+    return Clock(options.steps, budget, options.progress_power)

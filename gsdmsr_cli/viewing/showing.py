@@ -160,6 +160,7 @@ def _version(data: bytes) -> str:
 
 
 def _time_left(run: Run, elapsed: float, progress: float) -> float:
-    """Return the wall time that is left of a training [s]."""
-    length = run.preset.training
-    return time_left(elapsed, progress, 1.0 if length.budget is None else length.budget_power)
+    """Return the wall time that is left of a training [s]; moments of a stream have no power."""
+    preset = run.preset
+    power = 1.0 if preset.stream.enabled else preset.training.progress_power
+    return time_left(elapsed, progress, power)
