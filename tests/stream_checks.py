@@ -21,12 +21,16 @@ OPTIONS = (
 )  # fmt: skip
 
 
-def preset_of(*options: str) -> Preset:
-    return load_preset("persistent", None, [*OPTIONS, *options])
+WAYS = "persistent", "hicom", "3dgstream"
+"""Presets of streams."""
 
 
-def stream_trainer(data: Path, *options: str) -> StreamTrainer:
-    preset = preset_of(*options)
+def preset_of(*options: str, way: str = WAYS[0]) -> Preset:
+    return load_preset(way, None, [*OPTIONS, *options])
+
+
+def stream_trainer(data: Path, *options: str, way: str = WAYS[0]) -> StreamTrainer:
+    preset = preset_of(*options, way=way)
     pictures = Pictures((1.0, 1.0, 1.0), 1, 1 << 24)
     return StreamTrainer(read_scene(data), preset, best_engine("cpu"), pictures)
 

@@ -42,6 +42,8 @@ class Parameter:
         fill: value of a row that is new: of a splat that has stood still and begins to move.
         time_axis: the dimension whose entries belong to times from 0 to 1, if there is one.
         time_place: where times lie on it; it rises from 0 to 1.
+        rows_per_splat: how many rows it has at most for each splat, where it is shared and its rows
+            are counted in training; 0 where they are counted at the start.
     """
 
     name: str
@@ -51,6 +53,7 @@ class Parameter:
     fill: float = 0.0
     time_axis: int | None = None
     time_place: Place = evenly
+    rows_per_splat: int = 0
 
     def __post_init__(self) -> None:
         self.tensor.requires_grad_(self.rate is not None)

@@ -36,7 +36,7 @@ FOLDER = "moments"
 SCHEMA = 1
 
 TRACKS = "offsets", "turns"
-"""What a moment after the first holds, (N, 3) and (N, 4), see ``model.motion.tracks``."""
+"""What a moment after the first holds, (R, 3) and (R, 4), see ``model.motion._streamed``."""
 
 _NAME = re.compile(r"(\d{6,})\.safetensors")
 
@@ -101,14 +101,23 @@ def rewind(root: Path, moment: int) -> None:
         remove_if_empty(root / FOLDER)
 
 
-def write_first(root: Path, tensors: Mapping[str, Tensor], time: float, told: object) -> int:
-    """Write the first moment: the tensors of the model that stay; return its bytes.
+def write_first(
+    root: Path, tensors: Mapping[str, Tensor], rows: int, time: float, told: object
+) -> int:
+    """Write the first moment; return its bytes.
+
+    Args:
+        root: the run folder.
+        tensors: those of the model that stay.
+        rows: how many rows the later moments have.
+        time: of the moment, in [0, 1].
+        told: plain JSON that is kept with it.
 
     Raises:
         DataError: it cannot be written.
     """
     whole = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
-    return _write(root, 0, whole, {"time": time, "keyframe": 0, "told": told})
+    return _write(root, 0, whole, {"time": time, "keyframe": 0, "rows": rows, "told": told})
 
 
 def write(
@@ -164,7 +173,7 @@ def read(root: Path, moment: int) -> Written:
 
 
 def tracks_of(root: Path, found: Written) -> dict[str, Tensor]:
-    """Return offsets (N, 3) and turns (N, 4) of a moment after the first.
+    """Return offsets (R, 3) and turns (R, 4) of a moment after the first.
 
     Read with no other file than that of its keyframe.
 

@@ -58,14 +58,14 @@ def load(root: Path) -> Checkpoint:
 
 
 def _tracks(root: Path, first: moments.Written, later: list[moments.Written]) -> dict[str, Tensor]:
-    """Return the tensors of the motion ``tracks``."""
+    """Return the tensors of a motion that is learnt moment after moment."""
     found = [moments.tracks_of(root, file) for file in later]
     if not found:
-        count = len(first.tensors["splats.means"])
+        count = int(first.about.get("rows", len(first.tensors["splats.means"])))
         found = [{"offsets": torch.zeros(count, 3), "turns": torch.zeros(count, 4)}]
         later = [first]
     if len({len(each["offsets"]) for each in found}) != 1:
-        raise ValueError("moments of different numbers of splats")
+        raise ValueError("moments of different numbers of rows")
     times = [float(file.about["time"]) for file in (first, *later)]
     tensors = {f"{MOTION}.times": torch.tensor(times, dtype=torch.float64)}
     for name in moments.TRACKS:

@@ -40,7 +40,7 @@ def splats() -> dict[str, Tensor]:
 @pytest.fixture
 def root(tmp_path: Path) -> Path:
     """A run folder of a stream of so many moments."""
-    moments.write_first(tmp_path, splats(), 0.0, TOLD)
+    moments.write_first(tmp_path, splats(), COUNT, 0.0, TOLD)
     for moment in range(1, MOMENTS):
         moments.write(tmp_path, moment, moment / (MOMENTS - 1), values_at(moment), ROUNDING, TOLD)
     return tmp_path
@@ -107,7 +107,7 @@ def test_all_moments_together_are_the_single_ones(root: Path) -> None:
 
 
 def test_a_stream_of_one_moment_stands_still(tmp_path: Path) -> None:
-    moments.write_first(tmp_path, splats(), 0.25, TOLD)
+    moments.write_first(tmp_path, splats(), COUNT, 0.25, TOLD)
     found = stream.load(tmp_path).tensors
     assert found["motion.times"].tolist() == [0.25, 0.25]
     assert found["motion.past_turns"].shape == (COUNT, 0, 4) and not found["motion.offsets"].any()

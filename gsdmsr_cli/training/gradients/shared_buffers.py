@@ -77,5 +77,7 @@ class SharedBuffers:
 
 
 def _most_values(parameter: Parameter, capacity: int) -> int:
-    shape = parameter.tensor.shape
-    return math.prod(shape[1:]) * capacity if parameter.per_splat else parameter.tensor.numel()
+    rows = 1 if parameter.per_splat else parameter.rows_per_splat
+    if not rows:
+        return parameter.tensor.numel()
+    return math.prod(parameter.tensor.shape[1:]) * capacity * rows

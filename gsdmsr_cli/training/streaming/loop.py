@@ -142,11 +142,12 @@ def write_moment(run: Run, trainer: StreamTrainer) -> int:
     clock, time, options = trainer.clock, trainer.shot.time, trainer.preset.stream
     told = {"step": clock.step, "progress": clock.overall, "elapsed": clock.elapsed}
     if not clock.moment:
-        model = trainer.model
+        model, motion = trainer.model, trainer.motion
         stay = {n: t for n, t in model.tensors().items() if not n.startswith(f"{MOTION}.")}
+        stay |= {f"{MOTION}.{name}": motion.tensors()[name] for name in motion.staying}
         if model.moving < len(model.splats):
             stay[MOVING] = trainer.checkpoint().tensors[MOVING]
-        return moments.write_first(run.root, stay, time, told)
-    values = {"offsets": trainer.tracks.offsets, "turns": trainer.tracks.turns}
+        return moments.write_first(run.root, stay, len(motion.offsets), time, told)
+    values = {"offsets": trainer.motion.offsets, "turns": trainer.motion.turns}
     rounding = Rounding(options.place_step, options.turn_step, options.keyframe_every)
     return moments.write(run.root, clock.moment, time, values, rounding, told)

@@ -6,12 +6,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from statistics import median
 
+from gsdmsr_cli.ground import plugins
 from gsdmsr_cli.ground.errors import DataError, UsageError
+from gsdmsr_cli.model import motion as motions
 from gsdmsr_cli.options.preset import Preset
 from gsdmsr_cli.scene.scene import Scene, View
-
-MOTION = "tracks"
-"""The motion that learns moment after moment."""
 
 LEAST = 2
 """Cameras that must see most of the moments: from one alone nothing is known of depth."""
@@ -47,10 +46,11 @@ def check_options(preset: Preset) -> None:
     if not preset.stream.enabled:
         return
     motion, start = preset.motion["name"], preset.splats.sh_start
-    if motion != MOTION:
+    if not _is_streamed(motion):
+        known = ", ".join(filter(_is_streamed, plugins.names(motions.__name__)))
         raise UsageError(
             f"motion.name is {motion}, which is not learnt moment after moment; with --stream it "
-            f"has to be {MOTION}, as in --preset persistent"
+            f"has to be one of {known}, as in --preset persistent"
         )
     if start > 0 and preset.splats.sh_degree > 0:
         raise UsageError(
@@ -59,6 +59,11 @@ def check_options(preset: Preset) -> None:
         )
     if preset.saliency.gate != "none":
         raise UsageError(f"saliency.gate is {preset.saliency.gate}; allowed with --stream: none")
+
+
+def _is_streamed(motion: str) -> bool:
+    """Return whether a motion is learnt moment after moment, which its module says."""
+    return bool(getattr(plugins.load(motions.__name__, motion), "STREAMED", False))
 
 
 def check_scene(scene: Scene) -> list[str]:

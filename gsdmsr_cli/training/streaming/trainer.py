@@ -13,7 +13,7 @@ from gsdmsr_cli.gaussians.moment import Moment
 from gsdmsr_cli.gaussians.splats import Splats
 from gsdmsr_cli.model.layer import Instant
 from gsdmsr_cli.model.model import MOTION
-from gsdmsr_cli.model.motion.tracks import Tracks
+from gsdmsr_cli.model.motion._streamed import Streamed
 from gsdmsr_cli.options.preset import Preset
 from gsdmsr_cli.raster import Engine
 from gsdmsr_cli.runs.checkpoints import Checkpoint
@@ -28,9 +28,6 @@ from gsdmsr_cli.training.streaming.shots import Shot, first_shot, shots_of
 from gsdmsr_cli.training.streaming.stiffness import Compared, Stiffness
 from gsdmsr_cli.training.trainer import PENALTY_EVERY, Penalty, Trainer
 
-TRACKED = f"{MOTION}.offsets", f"{MOTION}.turns"
-"""What a moment after the first learns."""
-
 _KEY = "stream"
 
 
@@ -38,7 +35,7 @@ class StreamTrainer(Trainer):
     """A trainer whose views are those of the present moment.
 
     At the first moment nothing moves, and all that is trained of splats and further layers is. At
-    later ones the tracks are alone; events do not happen, and there are always as many splats.
+    later ones the motion is alone; events do not happen, and there are always as many splats.
 
     Attributes:
         shots: of all moments.
@@ -71,9 +68,14 @@ class StreamTrainer(Trainer):
         return self.shots[self.clock.moment]
 
     @property
-    def tracks(self) -> Tracks:
-        """The motion."""
-        return cast(Tracks, self.model.layers[MOTION])
+    def motion(self) -> Streamed:
+        """The motion of the model."""
+        return cast(Streamed, self.model.layers[MOTION])
+
+    @property
+    def learnt(self) -> frozenset[str]:
+        """The names of what a moment after the first learns."""
+        return frozenset(f"{MOTION}.{name}" for name in self.motion.learnt)
 
     def begin_next(self) -> None:
         """Let the next moment begin where the last one would go on to."""
@@ -84,10 +86,10 @@ class StreamTrainer(Trainer):
                 self.population.begin_moving()
                 for name in self.model.trained():
                     self.optimizer.forget(name)
-            for name in TRACKED:
+            for name in self.learnt:
                 self.optimizer.forget(name)
             given = self.shots[0].time, last, self.shot.time
-            self.tracks.go_on(*given, self.preset.stream.extrapolate)
+            self.motion.go_on(*given, self.preset.stream.extrapolate)
             self.population.average.clear()
         self._see()
 
@@ -102,7 +104,7 @@ class StreamTrainer(Trainer):
                 for name, tensor in tensors.items():
                     tensor.copy_(average.tensors[name])
             average.clear()
-            self.tracks.settle()
+            self.motion.settle(self._moving(), first=not self.clock.moment)
         self.settled = True
 
     def _see(self) -> None:
@@ -135,46 +137,39 @@ class StreamTrainer(Trainer):
 
     def _compared(self) -> Compared:
         """Return the splats that move at this moment, the one before and the first."""
-        canonical = Moment(self.model.splats.map(lambda tensor: tensor[: self.model.moving]))
+        canonical = Moment(self._moving())
 
         def at(time: float) -> Splats:
-            return self.tracks.at(canonical, Instant(time)).splats
+            return self.motion.at(canonical, Instant(time)).splats
 
         with torch.no_grad():
             before, first = at(self._times[-2]), at(self._times[0])
         return Compared(at(self._times[-1]), before, first)
 
+    def _moving(self) -> Splats:
+        """Return the splats that move, as they are at the first moment, without a copy."""
+        return self.model.splats.map(lambda tensor: tensor[: self.model.moving])
+
     def _learning(self) -> dict[str, Tensor]:
         """Return what the present moment learns; what it does not loses its gradient."""
-        trained = self.model.trained()
+        trained, learnt = self.model.trained(), self.learnt
         later = self.clock.moment > 0
         for name, tensor in trained.items():
-            if (name in TRACKED) != later:
+            if (name in learnt) != later:
                 tensor.grad = None
-        return {name: tensor for name, tensor in trained.items() if (name in TRACKED) == later}
+        return {name: tensor for name, tensor in trained.items() if (name in learnt) == later}
 
     def _update(self, progress: float, loss: Tensor, gated: Sequence[ViewGradients] | None) -> None:
         super()._update(progress, loss, gated)
         if self.clock.moment:
             self._mend()
 
-    @torch.no_grad()
     def _mend(self) -> None:
-        """Take splats whose place or turn is not finite back to where the last moment left them.
-
-        They must not be dropped: every moment's file has the same splats.
-        """
-        tracks = self.tracks
-        for name, new, past in zip(
-            TRACKED, (tracks.offsets, tracks.turns), (tracks.past_offsets, tracks.past_turns),
-            strict=True,
-        ):  # fmt: skip
-            if not (lost := ~new.isfinite().all(dim=1)).any():
-                continue
-            new[lost] = past[lost, 0]
+        """Let the motion mend what is not finite, which then has no momentum."""
+        for name, lost in self.motion.mend().items():
             for moments in (self.optimizer.first, self.optimizer.second):
-                if name in moments:
-                    moments[name][lost] = 0
+                if (own := moments.get(f"{MOTION}.{name}")) is not None:
+                    own[lost] = 0
 
     def _apply_events(self, tick: Tick) -> None:
         if not self.clock.moment:

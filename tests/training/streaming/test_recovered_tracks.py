@@ -32,25 +32,29 @@ def turning(means: Tensor, time: float) -> Tensor:
     return means @ torch.stack(rows).mT
 
 
-def preset_of(*options: str) -> Preset:
+WAYS = {"persistent": ["motion.rate=[4e-3,1e-4]"], "hicom": ["motion.splats=[6,1]"]}
+"""Presets that follow single splats, and options for so few."""
+
+
+def preset_of(way: str) -> Preset:
     own = (
         "splats.start=box",
         "training.steps=1",
         "stream.steps=50",
-        "motion.rate=[4e-3,1e-4]",
         "stream.neighbours=3",
     )
     held = [option for option in OPTIONS if "average_from" not in option]
-    return load_preset("persistent", None, [*held, "data.background=white", *own, *options])
+    return load_preset(way, None, [*held, "data.background=white", *own, *WAYS[way]])
 
 
+@pytest.mark.parametrize("way", WAYS)
 @pytest.mark.parametrize("path", [circling, turning], ids=lambda path: path.__name__)
 def test_splats_are_followed_to_a_hundredth_of_their_paths(
-    path: Callable[[Tensor, float], Tensor], tmp_path: Path
+    path: Callable[[Tensor, float], Tensor], tmp_path: Path, way: str
 ) -> None:
     case = Case({"name": "tracks"}, moved(path), between=False)
     scene, pictures = scene_of(case, tmp_path), Pictures(WHITE, 1, 1 << 24)
-    trainer = StreamTrainer(scene, preset_of(), best_engine("cpu"), pictures)
+    trainer = StreamTrainer(scene, preset_of(way), best_engine("cpu"), pictures)
     with torch.no_grad():
         for name, tensor in canonical_splats().tensors().items():
             trainer.model.splats.tensors()[name].copy_(tensor)

@@ -8,18 +8,21 @@ from pathlib import Path
 import pytest
 import torch
 from rigs import write_rig
-from stream_checks import EACH, FIRST, MOMENTS, preset_of, stream_trainer, through
+from stream_checks import EACH, FIRST, MOMENTS, WAYS, preset_of, stream_trainer, through
 from training_checks import assert_same_tensors, copies, run_of
 
 from gsdmsr_cli.backends.cpu import jit
 from gsdmsr_cli.training.gradients.phase import Order
 from gsdmsr_cli.training.streaming import trainer as module
-from gsdmsr_cli.training.streaming.trainer import TRACKED, StreamTrainer
+from gsdmsr_cli.training.streaming.trainer import StreamTrainer
 
 
 @pytest.fixture(scope="module")
 def rig(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_rig(tmp_path_factory.mktemp("rig"), moments=MOMENTS)
+
+
+every_way = pytest.mark.parametrize("way", WAYS)
 
 
 @pytest.fixture
@@ -48,22 +51,28 @@ def test_each_moment_sees_its_own_pictures_and_all_of_them_before_any_again(
     assert not seen
 
 
-def test_after_the_first_moment_tracks_alone_change(trainer: StreamTrainer) -> None:
+@every_way
+def test_after_the_first_moment_the_motion_alone_changes(rig: Path, way: str) -> None:
+    trainer = stream_trainer(rig, way=way)
     through(trainer, 1)
-    assert not trainer.tracks.offsets.any() and len(trainer.model.splats) != 150
+    assert not trainer.motion.offsets.any() and len(trainer.model.splats) != 150
     before = copies(trainer.model.tensors())
     trainer.begin_next()
     through(trainer, 3)
+    trainer.begin_next()
+    trainer.step()
+    staying = {f"motion.{name}" for name in trainer.motion.staying}
     for name, tensor in trainer.model.tensors().items():
-        stays = not name.startswith("motion.")
+        stays = not name.startswith("motion.") or name in staying
         assert torch.equal(tensor, before[name]) == stays, name
-    assert set(trainer.optimizer.first) == set(TRACKED)
+    assert set(trainer.optimizer.first) == trainer.learnt
 
 
-def test_the_loss_of_a_moment_falls(tmp_path: Path) -> None:
+@every_way
+def test_the_loss_of_a_moment_falls(tmp_path: Path, way: str) -> None:
     free = [f"stream.{key}=0" for key in ("rigidity", "rotation_similarity", "isometry")]
     options = "training.steps=200", "stream.steps=60", "training.low_resolution_until=0", *free
-    trainer = stream_trainer(write_rig(tmp_path, moments=2, span=0.1), *options)
+    trainer = stream_trainer(write_rig(tmp_path, moments=2, span=0.1), *options, way=way)
     through(trainer, 1)
     trainer.begin_next()
     losses = [float(trainer.step().loss) for _ in range(60)]
@@ -77,7 +86,7 @@ def test_the_result_of_a_moment_is_the_mean_of_its_last_steps(trainer: StreamTra
         trainer.step()
     average = copies(trainer.population.average.tensors)
     trainer.settle()
-    assert torch.equal(trainer.tracks.offsets, average["motion.offsets"])
+    assert torch.equal(trainer.motion.offsets, average["motion.offsets"])
     settled = copies(trainer.model.tensors())
     trainer.settle()
     assert_same_tensors(copies(trainer.model.tensors()), settled)
@@ -90,37 +99,69 @@ def test_a_place_that_is_not_finite_goes_back_to_the_last_moment(trainer: Stream
     trainer.step()
     count = len(trainer.model.splats)
     with torch.no_grad():
-        trainer.tracks.offsets[3, 1] = torch.nan
-        trainer.tracks.turns[5, 2] = torch.inf
-    past = trainer.tracks.past_offsets[3, 0].clone(), trainer.tracks.past_turns[5, 0].clone()
+        trainer.motion.offsets[3, 1] = torch.nan
+        trainer.motion.turns[5, 2] = torch.inf
+    past = trainer.motion.past_offsets[3, 0].clone(), trainer.motion.past_turns[5, 0].clone()
     trainer._mend()
-    assert torch.equal(trainer.tracks.offsets[3], past[0])
-    assert torch.equal(trainer.tracks.turns[5], past[1])
+    assert torch.equal(trainer.motion.offsets[3], past[0])
+    assert torch.equal(trainer.motion.turns[5], past[1])
     while trainer.clock.progress < 1:
         trainer.step()
     assert len(trainer.model.splats) == count
     assert all(t.isfinite().all() for t in trainer.model.tensors().values())
 
 
-def test_workers_change_nothing(rig: Path) -> None:
+def test_a_grid_that_is_not_finite_goes_on_from_nothing(rig: Path) -> None:
+    trainer = stream_trainer(rig, way="3dgstream")
+    through(trainer, 2)
+    trainer.begin_next()
+    trainer.step()
+    with torch.no_grad():
+        trainer.motion.tensors()["table"][3, 1] = torch.nan
+    trainer._mend()
+    assert trainer.motion.tensors()["table"][3, 1] == 0
+    assert trainer.optimizer.first["motion.table"][3, 1] == 0
+    through(trainer, MOMENTS)
+    assert all(t.isfinite().all() for t in trainer.model.tensors().values())
+
+
+@every_way
+def test_what_is_drawn_stays_as_a_moment_ends(rig: Path, way: str) -> None:
+    trainer = stream_trainer(rig, "training.average_from=1", way=way)
+    through(trainer, 2)
+    trainer.begin_next()
+    while trainer.clock.progress < 1:
+        trainer.step()
+    seen = []
+    for _ in range(2):
+        seen.append(trainer.model.at(trainer.model.instant(trainer.shot.time)).splats)
+        trainer.settle()
+    assert not torch.equal(seen[0].means, trainer.model.splats.means)
+    torch.testing.assert_close(seen[1].means, seen[0].means, rtol=0, atol=1e-6)
+    torch.testing.assert_close(seen[1].quats, seen[0].quats, rtol=0, atol=1e-5)
+
+
+@every_way
+def test_workers_change_nothing(rig: Path, way: str) -> None:
     if not (sys.platform.startswith("linux") and jit.set_threads(2) == 2 and jit.may_fork()):
         pytest.skip("processes cannot be forked here, or there is one core")
-    with stream_trainer(rig) as helped:
+    with stream_trainer(rig, way=way) as helped:
         helped.start_workers(lambda: None)
         assert len(helped.workers) == 2
         through(helped, MOMENTS)
         found = copies(helped.checkpoint().tensors)
     jit.set_threads(0)
-    alone = stream_trainer(rig)
+    alone = stream_trainer(rig, way=way)
     through(alone, MOMENTS)
     assert_same_tensors(found, copies(alone.checkpoint().tensors))
 
 
+@every_way
 @pytest.mark.parametrize("steps", [FIRST // 2, FIRST, FIRST + 3, FIRST + EACH + 5])
 def test_a_stream_that_is_resumed_ends_as_one_that_was_not(
-    rig: Path, tmp_path: Path, steps: int
+    rig: Path, tmp_path: Path, steps: int, way: str
 ) -> None:
-    whole, first, second = (stream_trainer(rig) for _ in range(3))
+    whole, first, second = (stream_trainer(rig, way=way) for _ in range(3))
     through(whole, MOMENTS)
     while first.clock.step < steps:
         if first.clock.progress >= 1:
