@@ -26,8 +26,15 @@ from torch import Tensor
 
 from gsdmsr_cli.gaussians.moment import Moment
 from gsdmsr_cli.ground.splatting_constants import ALPHA_MAX, TRANSMITTANCE_STOP, tile_grid
-from gsdmsr_cli.raster import Comparing, Engine, engine_names, load_engine, reference
-from gsdmsr_cli.training.gradients.compare import compare_frame
+from gsdmsr_cli.raster import (
+    Comparing,
+    Comparison,
+    Engine,
+    engine_names,
+    load_engine,
+    reference,
+)
+from gsdmsr_cli.training.gradients.compare import judge
 
 FORWARD = 1e-4  # largest error of a pixel; of depth, relative to the farthest splat
 BACKWARD = 1e-3  # error of a gradient in the L2 norm, relative
@@ -239,10 +246,12 @@ def compared(
         weights = torch.rand(tiles, generator=rng).to(device) * 3
         weights[::3] = 0
     frame = engine.rasterize(leaves, of.camera, background, of.sh_degree)
+    judged = judge(frame, target, ssim, weights)
+    (on_screen,) = torch.autograd.grad(judged.unweighted, frame.means2d, retain_graph=True)
     results = []
     for found in (
         engine.compare(leaves, of.camera, background, target, ssim, of.sh_degree, weights),
-        compare_frame(frame, target, ssim, weights),
+        Comparison(judged.loss, on_screen, judged.errors),
     ):
         gradients = torch.autograd.grad(2 * found.loss, tensors)
         errors = [] if found.errors is None else [found.errors]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -12,7 +13,7 @@ from gsdmsr_cli.gaussians.moment import Moment
 from gsdmsr_cli.model.layer import Instant
 from gsdmsr_cli.model.model import Model
 from gsdmsr_cli.ops.photometric import photometric_loss, tile_errors
-from gsdmsr_cli.raster import Comparing, ComparingViews, Comparison, Engine
+from gsdmsr_cli.raster import Comparing, ComparingViews, Engine
 from gsdmsr_cli.scene.camera import Camera
 from gsdmsr_cli.training.gradients.inliers import inliers
 from gsdmsr_cli.training.gradients.phase import ViewGradients
@@ -51,14 +52,15 @@ def compare(
     """
     given = moment, camera, background, target, ssim_weight, sh_degree, tile_weights
     whole = counted is None and normal == 1
+    size = camera.width, camera.height
     if whole and moment.features is None and isinstance(engine, Comparing):
         found = engine.compare(*given)
-    else:
-        frame = engine.rasterize(moment, camera, background, sh_degree)
-        found = compare_frame(frame, target, ssim_weight, tile_weights, counted, normal)
-    size = camera.width, camera.height
-    gradients = gradients_of(found.loss, model)
-    return ViewGradients(found.loss.detach(), gradients, found.on_screen, size, found.errors)
+        gradients = gradients_of(found.loss, model)
+        return ViewGradients(found.loss.detach(), gradients, found.on_screen, size, found.errors)
+    frame = engine.rasterize(moment, camera, background, sh_degree)
+    judged = judge(frame, target, ssim_weight, tile_weights, counted, normal)
+    gradients, on_screen = differentiate(judged.loss, judged, frame, model)
+    return ViewGradients(judged.loss.detach(), gradients, on_screen, size, judged.errors)
 
 
 def compare_views(
@@ -101,25 +103,62 @@ def draw_and_compare(
     counted: Tensor | None = None,
     normal: float = 1.0,
     with_depth: bool = False,
-) -> tuple[Comparison, Frame]:
+) -> tuple[Judged, Frame]:
     """Draw a moment, let the model shade the frame, compare; return the frame as well.
 
     Arguments as in ``compare``; ``with_depth`` as in ``Engine.rasterize``.
     """
     frame = engine.rasterize(moment, camera, background, sh_degree, with_depth)
     frame = model.shade(frame, instant)
-    return compare_frame(frame, target, ssim_weight, tile_weights, counted, normal), frame
+    return judge(frame, target, ssim_weight, tile_weights, counted, normal), frame
 
 
-def compare_frame(
+class Judged(NamedTuple):
+    """What is said of a frame that has been drawn.
+
+    Attributes:
+        loss: of the picture.
+        unweighted: the loss as if all tiles with a weight above 0 had the weight 1; the very same
+            tensor where there are no weights.
+        errors: see ``Comparison``.
+    """
+
+    loss: Tensor
+    unweighted: Tensor
+    errors: Tensor | None
+
+
+def differentiate(
+    loss: Tensor, judged: Judged, frame: Frame, model: Model
+) -> tuple[Sequence[Tensor | None], Tensor]:
+    """Return the gradients of a loss by all trained tensors, and of the unweighted by the screen.
+
+    Args:
+        loss: of the frame, and of further terms.
+        judged: of the frame alone.
+        frame: what was judged.
+        model: whose it is.
+
+    Returns:
+        the gradients, and (N, 2) those by the positions on the screen [1 / px].
+    """
+    if loss is judged.unweighted:  # going back through the picture is what takes long: once will do
+        wanted = [*model.trained().values(), frame.means2d]
+        *gradients, on_screen = torch.autograd.grad(loss, wanted, allow_unused=True)
+        return gradients, on_screen
+    (on_screen,) = torch.autograd.grad(judged.unweighted, frame.means2d, retain_graph=True)
+    return gradients_of(loss, model), on_screen
+
+
+def judge(
     frame: Frame,
     target: Tensor,
     ssim_weight: float,
     tile_weights: Tensor | None = None,
     counted: Tensor | None = None,
     normal: float = 1.0,
-) -> Comparison:
-    """Return what ``Comparing.compare`` does, of a frame that has been drawn.
+) -> Judged:
+    """Compare a frame that has been drawn with a target, as ``Comparing.compare`` does.
 
     Pixels that do not count are taken for right, also by the windows of SSIM.
     """
@@ -135,8 +174,7 @@ def compare_frame(
         errors = errors * (tile_weights > 0)
         loss = ((errors * tile_weights).sum() / target.numel()).to(rgb.dtype)
         unweighted = errors.sum() / target.numel()
-    (on_screen,) = torch.autograd.grad(unweighted, frame.means2d, retain_graph=True)
-    return Comparison(loss, on_screen, None if errors is None else errors.detach())
+    return Judged(loss, unweighted, None if errors is None else errors.detach())
 
 
 def _right_outside(counted: Tensor, rgb: Tensor, target: Tensor) -> Tensor:

@@ -21,8 +21,8 @@ from gsdmsr_cli.scene.scene import MASK, View
 from gsdmsr_cli.training.gradients.compare import (
     compare,
     compare_views,
+    differentiate,
     draw_and_compare,
-    gradients_of,
 )
 from gsdmsr_cli.training.gradients.phase import Order, Phase, ViewGradients
 from gsdmsr_cli.training.losses import Seen, start_term
@@ -114,13 +114,13 @@ class TrainingRenderer:
         wanted = [instant, *(other for other in others if other is not None)]
         moments = dict(zip(wanted, self._moved(model, wanted, phase), strict=True))
         traced = model.trace(moments[instant], instant)  # terms say nothing of where views are from
-        found, frame = draw_and_compare(
+        judged, frame = draw_and_compare(
             self.engine, model, traced, instant, camera, self.background, target,
             self._ssim_weight(phase.progress), self._sh_degree(phase.progress),
             self._on_device(order.tile_weights), pictures.signal(view, MASK),
             self.preset.losses.inliers, any(term.needs_depth for term in self.terms),
         )  # fmt: skip
-        loss = found.loss
+        loss = judged.loss
         for term, weight, other in zip(self.terms, weights, others, strict=True):
             if weight > 0:
                 then = None if other is None else moments[other]
@@ -130,10 +130,9 @@ class TrainingRenderer:
                     model.placed,
                 )  # fmt: skip
                 loss = loss + weight * term(seen)
-        return ViewGradients(
-            loss.detach(), gradients_of(loss, model), found.on_screen,
-            (camera.width, camera.height), found.errors,
-        )  # fmt: skip
+        gradients, on_screen = differentiate(loss, judged, frame, model)
+        size = camera.width, camera.height
+        return ViewGradients(loss.detach(), gradients, on_screen, size, judged.errors)
 
     def other_times(
         self, view: View, times: Sequence[float], generator: torch.Generator
