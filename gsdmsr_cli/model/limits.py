@@ -33,3 +33,16 @@ def require_hash_levels(options: object, levels: str, features: str) -> None:
     require(options, features, 1 <= each <= 8, "1 to 8")
     whole = count * each % LANES == 0
     require(options, levels, whole, f"times {features} a multiple of {LANES}")
+
+
+def require_hash_sizes(options: object, *resolutions: str) -> None:
+    """Check pairs of resolutions of a hash grid's levels, and ``log2_rows``.
+
+    Raises:
+        InvalidError: a pair falls or is below 2, or tables have too few or too many rows.
+    """
+    for key in resolutions:
+        low, high = getattr(options, key)
+        require(options, key, 2 <= low <= high, "[first, last], the first 2 or more")
+    rows = vars(options)["log2_rows"]
+    require(options, "log2_rows", 4 <= rows <= 24, "4 to 24")

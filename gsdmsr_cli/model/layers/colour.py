@@ -15,7 +15,7 @@ from gsdmsr_cli.gaussians.moment import Moment
 from gsdmsr_cli.gaussians.splats import Splats
 from gsdmsr_cli.ground.errors import UsageError
 from gsdmsr_cli.model.layer import Facts, Instant, Layer
-from gsdmsr_cli.model.limits import require_hash_levels, require_multiples
+from gsdmsr_cli.model.limits import require_hash_levels, require_hash_sizes, require_multiples
 from gsdmsr_cli.model.parameter import Parameter, name_parameters
 from gsdmsr_cli.ops import hash_grid, network, planes
 from gsdmsr_cli.options.strict import require
@@ -44,9 +44,7 @@ class Options:
 
     def __post_init__(self) -> None:
         require_hash_levels(self, "levels", "features")
-        low, high = self.resolutions
-        require(self, "resolutions", 2 <= low <= high, "[first, last], the first 2 or more")
-        require(self, "log2_rows", 4 <= self.log2_rows <= 24, "4 to 24")
+        require_hash_sizes(self, "resolutions")
         require_multiples(self, "width")
         require(self, "rate", min(self.rate) > 0, "[start, end], both above 0")
 

@@ -17,7 +17,7 @@ from torch import Tensor
 from gsdmsr_cli.gaussians.moment import Moment
 from gsdmsr_cli.gaussians.splats import Splats
 from gsdmsr_cli.model.layer import Facts, Instant, Layer
-from gsdmsr_cli.model.limits import require_hash_levels, require_multiples
+from gsdmsr_cli.model.limits import require_hash_levels, require_hash_sizes, require_multiples
 from gsdmsr_cli.model.motion._grids import split_times
 from gsdmsr_cli.model.parameter import Parameter, name_parameters
 from gsdmsr_cli.ops import hash_grid, network, planes
@@ -69,10 +69,7 @@ class Options:
     def __post_init__(self) -> None:
         require_hash_levels(self, "space_levels", "features")
         require_hash_levels(self, "time_levels", "features")
-        for key in ("space_resolutions", "plane_resolutions", "time_resolutions"):
-            low, high = getattr(self, key)
-            require(self, key, 2 <= low <= high, "[first, last], the first 2 or more")
-        require(self, "log2_rows", 4 <= self.log2_rows <= 24, "4 to 24")
+        require_hash_sizes(self, "space_resolutions", "plane_resolutions", "time_resolutions")
         require_multiples(self, "width")
         require(self, "rate", min(self.rate) > 0, "[start, end], both above 0")
         for key in ("smoothness", "reach", "time_reach"):

@@ -16,12 +16,12 @@ from torch import Tensor
 from gsdmsr_cli.gaussians.splats import Splats
 from gsdmsr_cli.ground.geometry import quat_product
 from gsdmsr_cli.model.layer import Facts
-from gsdmsr_cli.model.limits import require_hash_levels, require_multiples
+from gsdmsr_cli.model.limits import require_hash_levels, require_hash_sizes, require_multiples
 from gsdmsr_cli.model.motion._arcs import turned
 from gsdmsr_cli.model.motion._streamed import Knot, Streamed
 from gsdmsr_cli.model.parameter import Parameter, name_parameters
 from gsdmsr_cli.ops import hash_grid, network, planes
-from gsdmsr_cli.options.strict import require, require_rates
+from gsdmsr_cli.options.strict import require_rates
 
 STREAMED = True
 """It is learnt moment after moment."""
@@ -51,9 +51,7 @@ class Options:
 
     def __post_init__(self) -> None:
         require_hash_levels(self, "levels", "features")
-        low, high = self.resolutions
-        require(self, "resolutions", 2 <= low <= high, "[first, last], the first 2 or more")
-        require(self, "log2_rows", 4 <= self.log2_rows <= 24, "4 to 24")
+        require_hash_sizes(self, "resolutions")
         require_multiples(self, "width")
         require_rates(self, "rate")
 
