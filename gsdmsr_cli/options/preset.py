@@ -6,54 +6,29 @@ the power of ``budget_power``.
 
 from __future__ import annotations
 
-import math
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, Literal
 
 from gsdmsr_cli.backends.cuda.compiler import MOST_VIEWS
-from gsdmsr_cli.ground.errors import UsageError
 from gsdmsr_cli.options import preset_files, strict
-from gsdmsr_cli.options.strict import PROGRESS, require, require_progress, require_rates
-
-_SECONDS = {"s": 1.0, "m": 60.0, "h": 3600.0}
-_DURATION = "a positive duration such as 90s, 8m or 1.5h"
+from gsdmsr_cli.options.durations import require_duration
+from gsdmsr_cli.options.sequences import StreamOptions
+from gsdmsr_cli.options.strict import (
+    PROGRESS,
+    require,
+    require_at_least,
+    require_positive,
+    require_progress,
+    require_rates,
+)
 
 EVENTS = ("density", "opacity_reset", "thinning", "stillness")
 """Events that every training asks after a step, unless the preset says otherwise."""
 
 BACKGROUNDS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
 """The colours that pictures may be laid on."""
-
-
-def _duration(text: str) -> float | None:
-    match = re.fullmatch(r"(\d+(?:\.\d+)?)([smh])", text)
-    seconds = float(match[1]) * _SECONDS[match[2]] if match else 0.0
-    return seconds if 0.0 < seconds < math.inf else None
-
-
-def parse_duration(text: str) -> float:
-    """Return the seconds of "90s", "8m", "2.5m" or "1h".
-
-    Raises:
-        UsageError: the text is not a positive duration.
-    """
-    seconds = _duration(text)
-    if seconds is None:
-        raise UsageError(f"'{text}' is not a duration; allowed: {_DURATION}")
-    return seconds
-
-
-def _require_at_least(options: object, least: int, *keys: str) -> None:
-    for key in keys:
-        require(options, key, getattr(options, key) >= least, f"{least} or more")
-
-
-def _require_positive(options: object, *keys: str) -> None:
-    for key in keys:
-        require(options, key, getattr(options, key) > 0, "a number above 0")
 
 
 @dataclass(frozen=True)
@@ -72,8 +47,8 @@ class DataOptions:
     cache_mib: int = 4096
 
     def __post_init__(self) -> None:
-        _require_at_least(self, 1, "downscale")
-        _require_at_least(self, 0, "cache_mib")
+        require_at_least(self, 1, "downscale")
+        require_at_least(self, 0, "cache_mib")
 
 
 @dataclass(frozen=True)
@@ -97,7 +72,7 @@ class SplatOptions:
     sh_start: float = 0.3
 
     def __post_init__(self) -> None:
-        _require_at_least(self, 1, "count")
+        require_at_least(self, 1, "count")
         require(self, "opacity", 0.0 < self.opacity < 1.0, "a number between 0 and 1, neither")
         require(self, "sh_degree", 0 <= self.sh_degree <= 3, "0 to 3")
         require_progress(self, "sh_start")
@@ -158,21 +133,20 @@ class TrainingOptions:
     precision: Literal["float32", "bf16", "fp16"] = "float32"
 
     def __post_init__(self) -> None:
-        _require_at_least(self, 1, "steps", "keep")
+        require_at_least(self, 1, "steps", "keep")
         # the limit of a GPU is that of the CPU as well: a training may go on on the other
         within = 1 <= self.views_per_step <= MOST_VIEWS
         require(self, "views_per_step", within, f"1 to {MOST_VIEWS}")
-        known = self.budget is None or _duration(self.budget) is not None
-        require(self, "budget", known, f"null or {_DURATION}")
+        require_duration(self, "budget")
         require(self, "budget_power", 0.1 <= self.budget_power <= 10, "0.1 to 10")
         require_progress(self, "static_until", "low_resolution_until", "average_from")
         require_progress(self, "window_until")
         require(self, "window", 0 < self.window <= 1, "a share above 0, up to 1")
         require(self, "window_at", 0 <= self.window_at <= 1, "a time from 0 to 1")
         require(self, "window_newest", 0 <= self.window_newest <= 1, "a share from 0 to 1")
-        _require_positive(self, "checkpoint_minutes")
+        require_positive(self, "checkpoint_minutes")
         require(self, "seed", 0 <= self.seed < 2**32, "0 to 4294967295")
-        _require_at_least(self, 0, "static_steps", "threads", "tiles_per_view")
+        require_at_least(self, 0, "static_steps", "threads", "tiles_per_view")
 
     @property
     def progress_power(self) -> float:
@@ -233,7 +207,7 @@ class OptimizerOptions:
     embeddings: tuple[float, float] = (5e-3, 2e-3)
 
     def __post_init__(self) -> None:
-        _require_positive(self, "sh_rest")
+        require_positive(self, "sh_rest")
         require_rates(self, *(rate.name for rate in fields(self) if rate.name != "sh_rest"))
 
 
@@ -274,10 +248,10 @@ class DensityOptions:
     thin_share: float = 0.3
 
     def __post_init__(self) -> None:
-        _require_at_least(self, 1, "every", "rounds", "cap")
-        _require_at_least(self, 0, "start")
+        require_at_least(self, 1, "every", "rounds", "cap")
+        require_at_least(self, 0, "start")
         require_progress(self, "until")
-        _require_positive(self, "gradient", "split_scale", "prune_scale")
+        require_positive(self, "gradient", "split_scale", "prune_scale")
         require(self, "prune_opacity", 0.0 <= self.prune_opacity < 1.0, "0 or more, below 1")
         require(self, "reset_opacity", 0.0 < self.reset_opacity < 1.0, "above 0, below 1")
         require(self, "thin_share", 0.0 <= self.thin_share < 1.0, "0 or more, below 1")
@@ -331,59 +305,12 @@ class SaliencyOptions:
 
     def __post_init__(self) -> None:
         require_progress(self, "gate_from", "still_from")
-        _require_positive(self, "threshold", "low_rate", "still_below")
+        require_positive(self, "threshold", "low_rate", "still_below")
         require(self, "quantile", 0.0 <= self.quantile <= 1.0, "0 to 1")
         require(self, "release", 0.0 < self.release <= 1.0, "above 0, at most 1")
         require(self, "smoothing", 0.0 <= self.smoothing < 1.0, "0 or more, below 1")
-        _require_at_least(self, 0, "hold", "grace", "field_every")
-        _require_at_least(self, 1, "still_every")
-
-
-@dataclass(frozen=True)
-class StreamOptions:
-    """Moments trained one after the other, each from the one before, see ``training.streaming``.
-
-    The first takes ``training.steps`` or ``training.budget``. Progress goes from 0 to 1 in each.
-
-    Attributes:
-        enabled: whether that is done, in place of training all moments together.
-        steps: length of every moment after the first [steps], unless there is a budget.
-        budget: its length as wall time, such as "10s"; null counts steps.
-        extrapolate: share of the last velocity with which a moment begins, 0 to 1.
-        rigidity: weight of how far neighbouring splats are from moving as a rigid body, from one
-            moment to the next.
-        rotation_similarity: weight of how differently neighbours turn from one to the next.
-        isometry: weight of how far their distances are from those at the first moment.
-        neighbours: how many of its nearest others, at the first moment, a splat is compared with.
-        samples: splats that are compared with theirs in a step, chosen at random.
-        keyframe_every: moments from one that is written whole to the next; those in between are
-            written as differences from it.
-        place_step: what positions are rounded to where they are written [scene bounds].
-        turn_step: what quaternions of turns are rounded to there.
-    """
-
-    enabled: bool = False
-    steps: int = 200
-    budget: str | None = None
-    extrapolate: float = 1.0
-    rigidity: float = 0.05
-    rotation_similarity: float = 0.2
-    isometry: float = 0.02
-    neighbours: int = 8
-    samples: int = 4096
-    keyframe_every: int = 10
-    place_step: float = 1e-4
-    turn_step: float = 2e-3
-
-    def __post_init__(self) -> None:
-        _require_at_least(self, 1, "steps", "keyframe_every", "neighbours", "samples")
-        for key in ("rigidity", "rotation_similarity", "isometry"):
-            require(self, key, getattr(self, key) >= 0, "0 or more")
-        known = self.budget is None or _duration(self.budget) is not None
-        require(self, "budget", known, f"null or {_DURATION}")
-        require(self, "extrapolate", 0.0 <= self.extrapolate <= 1.0, "0 to 1")
-        for key in ("place_step", "turn_step"):
-            require(self, key, 1e-7 <= getattr(self, key) <= 0.1, "1e-7 to 0.1")
+        require_at_least(self, 0, "hold", "grace", "field_every")
+        require_at_least(self, 1, "still_every")
 
 
 @dataclass(frozen=True)

@@ -85,6 +85,26 @@ def require_progress(options: object, *keys: str) -> None:
         require(options, key, 0.0 <= getattr(options, key) <= 1.0, PROGRESS)
 
 
+def require_at_least(options: object, least: int, *keys: str) -> None:
+    """Check that fields are ``least`` or more.
+
+    Raises:
+        InvalidError: one is not.
+    """
+    for key in keys:
+        require(options, key, getattr(options, key) >= least, f"{least} or more")
+
+
+def require_positive(options: object, *keys: str) -> None:
+    """Check that fields are above 0.
+
+    Raises:
+        InvalidError: one is not.
+    """
+    for key in keys:
+        require(options, key, getattr(options, key) > 0, "a number above 0")
+
+
 def require_rates(options: object, *keys: str) -> None:
     """Check that learning rates, at the start and the end of a training, are above 0.
 

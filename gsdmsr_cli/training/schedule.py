@@ -6,7 +6,8 @@ import math
 import time
 from dataclasses import dataclass, field
 
-from gsdmsr_cli.options.preset import TrainingOptions, parse_duration
+from gsdmsr_cli.options.durations import parse_duration
+from gsdmsr_cli.options.preset import TrainingOptions
 
 
 def log_linear(ends: tuple[float, float], progress: float) -> float:

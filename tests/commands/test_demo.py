@@ -11,7 +11,8 @@ from gsdmsr_cli.commands import demo
 from gsdmsr_cli.demo.synthetic import write_scene
 from gsdmsr_cli.formats import dnerf
 from gsdmsr_cli.ground.errors import UsageError
-from gsdmsr_cli.options.preset import load_preset, parse_duration
+from gsdmsr_cli.options.durations import parse_duration
+from gsdmsr_cli.options.preset import load_preset
 
 Calls = list[tuple[str, tuple[Any, ...]]]
 

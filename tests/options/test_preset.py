@@ -10,7 +10,7 @@ import pytest
 
 from gsdmsr_cli.ground.errors import UsageError
 from gsdmsr_cli.options import preset_files, strict
-from gsdmsr_cli.options.preset import Preset, TrainingOptions, load_preset, parse_duration
+from gsdmsr_cli.options.preset import Preset, TrainingOptions, load_preset
 
 
 def write(folder: Path, name: str, text: str) -> Path:
@@ -254,21 +254,6 @@ def test_values_out_of_range_are_refused_where_they_stand(override: str, presets
     message = refusal(None, None, override)
     assert "; allowed: " in message
     assert message.startswith(f"--set {override}: ")
-
-
-@pytest.mark.parametrize(
-    ("text", "seconds"), [("90s", 90), ("8m", 480), ("2.5m", 150), ("1h", 3600), ("0.5s", 0.5)]
-)
-def test_durations(text: str, seconds: float) -> None:
-    assert parse_duration(text) == seconds
-
-
-@pytest.mark.parametrize(
-    "text", ["", "8", "m", "-1m", "0s", "1d", "8 m", "1e3s", "1m30s", "9" * 400 + "h"]
-)
-def test_other_texts_are_no_durations(text: str) -> None:
-    with pytest.raises(UsageError, match="is not a duration; allowed: "):
-        parse_duration(text)
 
 
 @pytest.mark.parametrize("in_file", [True, False])

@@ -6,7 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from gsdmsr_cli.options.preset import Preset, parse_duration
+from gsdmsr_cli.options.durations import parse_duration
+from gsdmsr_cli.options.preset import Preset
 from gsdmsr_cli.training.schedule import Clock
 
 

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from gsdmsr_cli.gaussians.splats import Splats
 from gsdmsr_cli.ops.nearest import nearest_points
-from gsdmsr_cli.options.preset import StreamOptions
+from gsdmsr_cli.options.sequences import StreamOptions
 from gsdmsr_cli.training.losses import isometry, rigidity, rotation_similarity
 from gsdmsr_cli.training.losses._neighbours import Neighbourhoods, NeighbourTerm
 

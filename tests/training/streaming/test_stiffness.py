@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from gsdmsr_cli.gaussians.splats import Splats
 from gsdmsr_cli.ground.geometry import quat_product
-from gsdmsr_cli.options.preset import StreamOptions
+from gsdmsr_cli.options.sequences import StreamOptions
 from gsdmsr_cli.training.streaming.stiffness import Compared, Stiffness, graph_of
 
 COUNT, NEAR = 200, 6
