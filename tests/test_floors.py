@@ -16,7 +16,7 @@ ROOMS = (
     "ground", "backends", "options", "gaussians", "scene", "ops", "raster", "model", "moving",
     "drawing", "runs", "formats", "player", "exports", "paths", "evaluation", "filming",
     "viewing",
-    "reporting", "training", "capture", "demo", "benchmark", "commands", "cli",
+    "reporting", "training", "capture", "demo", "calling", "benchmark", "commands", "cli",
 )  # fmt: skip
 """The folders of the package, from the ground up: each imports only from those before it."""
 

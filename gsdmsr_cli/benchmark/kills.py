@@ -14,8 +14,8 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from gsdmsr_cli.benchmark.calls import call
 from gsdmsr_cli.benchmark.ranks import train_in_ranks
+from gsdmsr_cli.calling.calls import call
 from gsdmsr_cli.ground.errors import DataError, GsdmsrError
 from gsdmsr_cli.runs.checkpoints import Checkpoint
 from gsdmsr_cli.runs.run import is_run, open_run

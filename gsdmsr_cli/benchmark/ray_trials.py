@@ -7,9 +7,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from gsdmsr_cli.benchmark.on_ray import connected, needs_of, require_workers
-from gsdmsr_cli.benchmark.ray_calls import call_on_ray
 from gsdmsr_cli.benchmark.trials import Terms, Trial, left_to_do, report_of
+from gsdmsr_cli.calling.on_ray import connected, needs_of, require_workers
+from gsdmsr_cli.calling.ray_calls import call_on_ray
 
 
 def run_on_ray(

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from gsdmsr_cli.benchmark.calls import start
+from gsdmsr_cli.calling.calls import start
 from gsdmsr_cli.ground.errors import GsdmsrError
 
 PROC = Path("/proc")

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from gsdmsr_cli.benchmark.calls import Line, call, call_side_by_side
+from gsdmsr_cli.calling.calls import Line, call, call_side_by_side
 from gsdmsr_cli.evaluation.lpips import weights_hashes
 from gsdmsr_cli.formats import read_scene
 from gsdmsr_cli.ground.errors import DataError

@@ -13,8 +13,9 @@ from pathlib import Path
 
 import pytest
 
-from gsdmsr_cli.benchmark import calls, trials
+from gsdmsr_cli.benchmark import trials
 from gsdmsr_cli.benchmark.trials import Terms, Trial, all_trials, run_side_by_side, run_trial
+from gsdmsr_cli.calling import calls
 from gsdmsr_cli.ground.errors import DataError, UsageError
 from gsdmsr_cli.ground.limits import cores
 from gsdmsr_cli.options.preset import load_preset

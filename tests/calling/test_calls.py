@@ -11,8 +11,8 @@ from typing import Any
 
 import pytest
 
-from gsdmsr_cli.benchmark import calls
-from gsdmsr_cli.benchmark.calls import Line, call, call_side_by_side
+from gsdmsr_cli.calling import calls
+from gsdmsr_cli.calling.calls import Line, call, call_side_by_side
 from gsdmsr_cli.ground.errors import GsdmsrError
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from gsdmsr_cli import __version__
-from gsdmsr_cli.benchmark.calls import INTERRUPTED, Line, start_logged
+from gsdmsr_cli.calling.calls import INTERRUPTED, Line, start_logged
 from gsdmsr_cli.ground.errors import DataError
 
 _POLL_S = 0.1

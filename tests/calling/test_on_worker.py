@@ -14,9 +14,9 @@ from typing import Any
 import pytest
 
 from gsdmsr_cli import __version__
-from gsdmsr_cli.benchmark import on_worker
-from gsdmsr_cli.benchmark.calls import INTERRUPTED
-from gsdmsr_cli.benchmark.on_worker import do
+from gsdmsr_cli.calling import on_worker
+from gsdmsr_cli.calling.calls import INTERRUPTED
+from gsdmsr_cli.calling.on_worker import do
 
 SLEEPS = "import time; time.sleep(20)"
 

@@ -11,8 +11,8 @@ from typing import Any
 
 import pytest
 
-from gsdmsr_cli.benchmark import ray_calls
-from gsdmsr_cli.benchmark.ray_calls import call_on_ray
+from gsdmsr_cli.calling import ray_calls
+from gsdmsr_cli.calling.ray_calls import call_on_ray
 
 
 class LosesInterrupts:

@@ -16,10 +16,10 @@ from typing import Any
 import pytest
 
 from gsdmsr_cli import __version__
-from gsdmsr_cli.benchmark.calls import Line
-from gsdmsr_cli.benchmark.on_ray import Needs, connected, needs_of, require_workers
-from gsdmsr_cli.benchmark.on_worker import lack
-from gsdmsr_cli.benchmark.ray_calls import call_on_ray
+from gsdmsr_cli.calling.calls import Line
+from gsdmsr_cli.calling.on_ray import Needs, connected, needs_of, require_workers
+from gsdmsr_cli.calling.on_worker import lack
+from gsdmsr_cli.calling.ray_calls import call_on_ray
 from gsdmsr_cli.ground.errors import DataError, GsdmsrError, UsageError
 from gsdmsr_cli.runs.run import open_run
 

@@ -11,7 +11,7 @@ from typing import Any
 from uuid import uuid4
 
 from gsdmsr_cli import __version__
-from gsdmsr_cli.benchmark.calls import Line
+from gsdmsr_cli.calling.calls import Line
 from gsdmsr_cli.ground.errors import DataError, UsageError
 from gsdmsr_cli.ground.files import write_text
 
@@ -100,7 +100,7 @@ def task_of_ray() -> Callable[..., tuple[str, int, str]]:
         import platform
 
         try:
-            from gsdmsr_cli.benchmark.on_worker import do
+            from gsdmsr_cli.calling.on_worker import do
         except ImportError as error:
             return platform.node(), 3, f"gsdmsr cannot be imported there: {error}"
         return do(line, log, threads, needs)

@@ -16,8 +16,8 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
-from gsdmsr_cli.benchmark.calls import INTERRUPTED, Line, failure
-from gsdmsr_cli.benchmark.on_ray import Needs, task_of_ray
+from gsdmsr_cli.calling.calls import INTERRUPTED, Line, failure
+from gsdmsr_cli.calling.on_ray import Needs, task_of_ray
 from gsdmsr_cli.ground import say
 from gsdmsr_cli.ground.errors import GsdmsrError
 
