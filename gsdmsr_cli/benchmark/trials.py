@@ -198,7 +198,7 @@ def _require_same(run: Run, trial: Trial, terms: Terms) -> None:
             f"{run.root}: holds a training with other options than '{trial.name}' has now; "
             "choose another --out"
         )
-    run.check_scene(read_scene(trial.scene))
+    run.part_of(read_scene(trial.scene))
 
 
 def _is_report_of(path: Path, saved: Checkpoint, terms: Terms) -> bool:

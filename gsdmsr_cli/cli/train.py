@@ -59,6 +59,19 @@ def train(
     stream: Annotated[
         bool, typer.Option("--stream", help="Train one moment after the other; see stream.md.")
     ] = False,
+    segments: Annotated[
+        int | None,
+        typer.Option(min=1, metavar="N", help="Cut the time into N trainings; see segments.md."),
+    ] = None,
+    jobs: Annotated[
+        int, typer.Option(min=1, metavar="N", help="Segments trained side by side.")
+    ] = 1,
+    workers: Annotated[
+        str | None,
+        typer.Option(
+            metavar="ray://HOST:PORT|auto|N", help="Train segments on a cluster of Ray; needs ray."
+        ),
+    ] = None,
     resume: Annotated[
         bool, typer.Option("--resume", help="Go on from RUN's last checkpoint.")
     ] = False,
@@ -95,13 +108,14 @@ def train(
         "training.threads": threads,
         "training.keep": keep,
         "stream.enabled": stream or None,
+        "segments.count": segments,
     }
     if stream and not resume:
         preset = preset or _STREAMED
     overrides = *(set_ or ()), *_overrides(options)
     named = data, out, preset, config, overrides, device
     request = Request(*named, resume, overwrite, dry_run, verify_data, tensorboard, wandb)
-    request = replace(request, view_port=port if live else None)
+    request = replace(request, view_port=port if live else None, jobs=jobs, workers=workers)
     from gsdmsr_cli.commands import train as command
 
     command.run(request)

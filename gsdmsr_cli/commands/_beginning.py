@@ -21,6 +21,7 @@ from gsdmsr_cli.runs.outputs import OUTPUTS
 from gsdmsr_cli.runs.run import Run, continue_run, create_run, is_run, open_run, refuse_used
 from gsdmsr_cli.runs.seen_pictures import check_whole
 from gsdmsr_cli.scene.scene import Scene
+from gsdmsr_cli.scene.segments import Segment, between
 from gsdmsr_cli.training.request import Request
 from gsdmsr_cli.training.schedule import new_clock
 from gsdmsr_cli.training.streaming.trainer import StreamTrainer
@@ -29,8 +30,10 @@ from gsdmsr_cli.training.trainer import Trainer
 MAY_CHANGE = (
     "training.budget", "training.steps", "training.threads", "training.checkpoint_minutes",
     "training.keep", "data.cache_mib", "stream.budget", "stream.steps",
+    "splats.of_run",
 )  # fmt: skip
-"""Options that a resumed training may have otherwise: its length, and what changes no result."""
+"""Options that a resumed training may have otherwise: its length, and what changes no result, such
+as where the run lies now whose splats it has begun with."""
 
 
 class _CompleteError(UsageError):
@@ -65,16 +68,18 @@ class Anew:
             if (request.out / name).is_dir():  # goes with the run, but not from under a writer
                 held.enter_context(sole_writer(request.out / name))
 
-    def suit(self, scene: Scene) -> None:
-        """Complete the options by the preset that suits the scene.
+    def suit(self, scene: Scene) -> Scene:
+        """Complete the options by the preset that suits the scene; return what is seen of it.
 
         Raises:
             UsageError: an option does not exist or is out of range.
+            DataError: no train view lies in that part.
         """
         chosen = self._choice.suit(scene)
         self.options, self.name, self.reason = chosen.options, chosen.name, chosen.reason
         if self.reason is not None:
             say.note(f"{self.reason}; --preset names another")
+        return between(scene, Segment(*self.options.data.between))
 
     def restore(self, trainer: Trainer) -> None:
         """Leave the training as it is: at its first step."""
@@ -104,7 +109,7 @@ class Resumed:
     def __init__(self, request: Request, held: ExitStack) -> None:
         self._request = request
         self._earlier = open_run(request.out)
-        self.options = _resumed_options(self._earlier, request)
+        self.options = resumed_options(self._earlier, request)
         self.name, self.reason = self._earlier.name, self._earlier.reason
         self._checkpoint, damage = self._earlier.load_whole()
         if damage:
@@ -120,11 +125,12 @@ class Resumed:
                 f"{checkpoint.elapsed:.0f} s; give it a longer --budget or more --steps"
             )
 
-    def suit(self, scene: Scene) -> None:
-        """Raise DataError unless the scene is that of the run."""
-        self._earlier.check_scene(scene)
+    def suit(self, scene: Scene) -> Scene:
+        """Return what is seen of the scene; raise DataError unless it is that of the run."""
+        part = self._earlier.part_of(scene)
         if self._request.verify:
-            check_whole(self._earlier.root, scene)
+            check_whole(self._earlier.root, part)
+        return part
 
     def restore(self, trainer: Trainer) -> None:
         """Take the training to where the checkpoint was made."""
@@ -176,7 +182,7 @@ def is_complete(run: Run, checkpoint: Checkpoint, length: TrainingOptions) -> bo
     return clock.progress >= 1 and bool(run.account(clock.step))
 
 
-def _resumed_options(earlier: Run, request: Request) -> Preset:
+def resumed_options(earlier: Run, request: Request) -> Preset:
     """Return the run's own options, with another length where the command line asks for one.
 
     Raises:

@@ -80,5 +80,5 @@ def _data(run: Run) -> dict[str, Any]:
         return {"layout": run.layout}
     there = place.is_dir()
     if there and not needs_preparing(place):
-        run.check_scene(read_scene(place))
+        run.part_of(read_scene(place))
     return {"data": str(place), "layout": run.layout, "data_is_there": there}

@@ -61,6 +61,15 @@ class Party:
         """Raise DataError in the first rank unless all have its data, versions and processor."""
 
 
+def require_alone(party: Party) -> None:
+    """Raise UsageError if several ranks are to train segments, which are trainings of their own."""
+    if party.ranks.size > 1:
+        raise UsageError(
+            f"{party.ranks.size} ranks cannot share segments, each of which is a training of its "
+            "own; leave torchrun out, and give --jobs or --workers"
+        )
+
+
 def require_suited(party: Party, options: Preset, device: str) -> None:
     """Raise UsageError if the ranks cannot share the steps of a training with these options."""
     size, views = party.ranks.size, options.training.views_per_step

@@ -36,7 +36,7 @@ LEAST_SECONDS = 2.0
 
 
 def read_data(run: Run, data: Path | None) -> Scene | None:
-    """Return the scene of a run, None if it is not where it was.
+    """Return what a run sees of its scene, None if it is not where it was.
 
     Raises:
         DataError: ``data`` is given and is not the run's, or cannot be read.
@@ -44,9 +44,7 @@ def read_data(run: Run, data: Path | None) -> Scene | None:
     place = data or run.data
     if place is None or (data is None and not place.is_dir()):
         return None
-    scene = read_scene(place)
-    run.check_scene(scene)
-    return scene
+    return run.part_of(read_scene(place))
 
 
 def judge_of(run: Run, model: Model, scene: Scene | None) -> Judge:

@@ -67,8 +67,7 @@ def open_trained(
     run, model, checkpoint = open_with_model(folder)
     place = _place_of_data(run, data)
     with one_of_readers(place):
-        scene = read_scene(place)
-        run.check_scene(scene)
+        scene = run.part_of(read_scene(place))
         if verify:
             check_whole(run.root, scene)
         renderer, device = _renderer(run, model, background, downscale)

@@ -21,6 +21,7 @@ from gsdmsr_cli.evaluation.request import Output
 from gsdmsr_cli.filming.request import Request as FilmRequest
 from gsdmsr_cli.formats import read_scene, recognised
 from gsdmsr_cli.ground import say
+from gsdmsr_cli.ground.errors import UsageError
 from gsdmsr_cli.ground.files import read_json
 from gsdmsr_cli.ground.locks import sole_writer
 from gsdmsr_cli.options.preset import load_preset
@@ -37,7 +38,12 @@ def run(request: Request) -> None:
         DataError: the input cannot be used, OUT not be written, or another process writes there.
         KeyboardInterrupt: Ctrl-C; what is finished is kept for the same command.
     """
-    load_preset(request.preset, None, _overrides(request))  # an error now, not minutes later
+    options = load_preset(request.preset, None, _overrides(request))  # an error now, not later
+    if options.segments.several:
+        raise UsageError(
+            f"segments.count is {options.segments.count}; allowed for make: 1, since its page "
+            "plays one model; take train --segments"
+        )
     making = Making(request)
     making.claim()
     with sole_writer(request.out), say.parts():

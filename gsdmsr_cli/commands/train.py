@@ -14,10 +14,11 @@ from gsdmsr_cli.backends.cuda import availability
 from gsdmsr_cli.commands._beginning import Anew, Beginning, Resumed, after_restart
 from gsdmsr_cli.commands._following import follow
 from gsdmsr_cli.commands._observers import OnReport, Wanted, find_observers, observing
-from gsdmsr_cli.commands._party import Party, require_suited
+from gsdmsr_cli.commands._party import Party, require_alone, require_suited
 from gsdmsr_cli.commands._plan import say_plan
 from gsdmsr_cli.commands._preparing import prepare, read, start_work, timed
 from gsdmsr_cli.commands._ranks import joined
+from gsdmsr_cli.commands._segments import is_cut, train_cut
 from gsdmsr_cli.commands._training_display import TrainingDisplay
 from gsdmsr_cli.commands._viewed import viewed
 from gsdmsr_cli.ground import machine, say
@@ -45,6 +46,12 @@ def run(request: Request) -> None:
         KeyboardInterrupt: Ctrl-C ended the training; its folder holds a checkpoint to go on from.
     """
     with joined() as party:
+        if is_cut(request):
+            require_alone(party)
+            train_cut(request)
+            return
+        if request.jobs > 1 or request.workers is not None:
+            raise UsageError("--jobs and --workers share out segments; give --segments as well")
         if party.leads:
             _lead(request, party)
         else:
@@ -63,9 +70,9 @@ def _lead(asked: Request, party: Party) -> None:
         if party.tell(begun is None) or request is None or begun is None:
             say.note(f"{asked.out}: torchrun has started a training again that is complete")
             return
+        party.tell(begun.beginning.options)
         with party.all_or_none():
             party.require_same(begun.scene)
-        party.tell(begun.beginning.options)
         with party.all_or_none():
             given = begun.scene, begun.options, party, begun.device
             trainer, prepare_s = timed(lambda: prepare(*given))
@@ -87,7 +94,7 @@ class _Begun:
         there: whether the run folder has been there, and is locked.
         beginning: how it begins.
         device: where it computes.
-        scene: its data.
+        scene: what it sees of its data.
         load_s: how long reading that took [s].
     """
 
@@ -111,8 +118,8 @@ def _begin(request: Request, party: Party, held: ExitStack) -> _Begun:
     device = raster.pick_device(request.device)
     _require_precision(beginning.options, request.device, device)
     held.enter_context(one_of_readers(request.data))
-    scene, load_s = timed(lambda: read(request))
-    beginning.suit(scene)
+    whole, load_s = timed(lambda: read(request))
+    scene = beginning.suit(whole)
     require_suited(party, beginning.options, device)
     if beginning.options.stream.enabled:
         for text in check_scene(scene):

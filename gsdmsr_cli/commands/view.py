@@ -21,6 +21,7 @@ from gsdmsr_cli.ground.errors import DataError, UsageError
 from gsdmsr_cli.options.preset import BACKGROUNDS
 from gsdmsr_cli.player.page import page
 from gsdmsr_cli.runs.run import Run, open_run, open_with_model
+from gsdmsr_cli.runs.segments import folder_of
 from gsdmsr_cli.scene.pictures import Pictures
 from gsdmsr_cli.scene.scene import Scene
 from gsdmsr_cli.training.loop import validation_view
@@ -60,6 +61,11 @@ def run(
     """
     torch.set_num_threads(1)
     set_threads(1)  # what is drawn here is little, and a training may want the cores
+    if open_run(run_folder).preset.segments.several:
+        raise UsageError(
+            f"{run_folder}: has the splats of several segments of time, and a page plays those of "
+            f"one; name a segment, such as {folder_of(run_folder, 0)}"
+        )
     _wait_for_splats(run_folder)
     found, model, _ = open_with_model(run_folder)
     if model.needs_camera:

@@ -5,12 +5,15 @@ Training wants gradients and no picture; see ``training.gradients``.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
+import torch
 from torch import Tensor
 
 from gsdmsr_cli.gaussians.frame import Frame
 from gsdmsr_cli.gaussians.moment import Moment
 from gsdmsr_cli.model.layer import Instant
-from gsdmsr_cli.model.model import Model
+from gsdmsr_cli.model.model import Model, Share
 from gsdmsr_cli.raster import Engine
 from gsdmsr_cli.scene.camera import Camera
 
@@ -44,20 +47,49 @@ def draw(
         instant, camera = model.instant_of_view(time, camera)
     else:
         instant = model.instant(time, camera)
-    moment = model.at(instant)
-    return draw_moment(model, moment, instant, camera, engine, background, sh_degree, with_depth)
+    return draw_shown(show(model, instant), camera, engine, background, sh_degree, with_depth)
 
 
-def draw_moment(
-    model: Model,
-    moment: Moment,
-    instant: Instant,
+Shown = Sequence[tuple[Share, Moment]]
+"""What is drawn at an instant: models that have part in the picture, and their splats."""
+
+
+def show(model: Model, instant: Instant) -> Shown:
+    """Return what is drawn of a model at an instant."""
+    return [(share, share.model.at(share.instant)) for share in model.shares(instant)]
+
+
+def draw_shown(
+    shown: Shown,
     camera: Camera,
     engine: Engine,
     background: Tensor,
     sh_degree: int | None = None,
     with_depth: bool = False,
 ) -> Frame:
-    """Draw ``model.at(instant)``; other arguments as in ``draw``."""
-    frame = engine.rasterize(moment, camera, background, sh_degree, with_depth)
-    return model.shade(frame, instant)
+    """Draw what ``show`` returns; other arguments as in ``draw``."""
+    frames = []
+    for share, moment in shown:
+        frame = engine.rasterize(moment, camera, background, sh_degree, with_depth)
+        frames.append((share.weight, share.model.shade(frame, share.instant)))
+    return frames[0][1] if len(frames) == 1 else _mean(frames)
+
+
+def _mean(frames: Sequence[tuple[float, Frame]]) -> Frame:
+    """Return the mean, by weights that add up to 1, of pictures of different splats."""
+    weights, drawn = zip(*frames, strict=True)
+
+    def mean(images: Sequence[Tensor]) -> Tensor:
+        weighted = [weight * image for weight, image in zip(weights, images, strict=True)]
+        return torch.stack(weighted).sum(dim=0)
+
+    depths = [frame.depth for frame in drawn if frame.depth is not None]
+    features = [frame.features for frame in drawn if frame.features is not None]
+    return Frame(
+        rgb=mean([frame.rgb for frame in drawn]),
+        alpha=mean([frame.alpha for frame in drawn]),
+        depth=mean(depths) if depths else None,
+        radii=torch.cat([frame.radii for frame in drawn]),
+        means2d=torch.cat([frame.means2d for frame in drawn]),
+        features=mean(features) if features else None,
+    )

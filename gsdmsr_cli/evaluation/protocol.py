@@ -14,6 +14,7 @@ from torch import Tensor
 from gsdmsr_cli.drawing.splatting import draw
 from gsdmsr_cli.evaluation.catalogue import Metric
 from gsdmsr_cli.evaluation.metrics import PSNR_CAP, Missing, psnr, quantize, ssim
+from gsdmsr_cli.model.joined import own_name
 from gsdmsr_cli.model.model import FURTHER, MOTION, STORED_AS, Model
 from gsdmsr_cli.raster import Engine
 from gsdmsr_cli.scene.pictures import Pictures
@@ -174,7 +175,8 @@ def storage(stored: Mapping[str, int]) -> dict[str, int]:
         stored: bytes of each tensor by its name, as ``Checkpoint.sizes`` has them.
     """
     sizes = {"splats_bytes": 0, "motion_bytes": 0, "training_state_bytes": 0}
-    for name, count in stored.items():
+    for stored_name, count in stored.items():
+        name = own_name(stored_name)
         splats, moved = name.startswith(STORED_AS), name.startswith((f"{MOTION}.", FURTHER))
         kind = "splats" if splats else "motion" if moved else "training_state"
         sizes[f"{kind}_bytes"] += count

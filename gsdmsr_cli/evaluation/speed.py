@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gsdmsr_cli.drawing.splatting import draw, draw_moment
+from gsdmsr_cli.drawing.splatting import draw, draw_shown, show
 from gsdmsr_cli.model.model import Model
 from gsdmsr_cli.raster import Engine
 from gsdmsr_cli.scene.camera import Camera
@@ -60,11 +60,10 @@ def measure_speed(
             torch.cuda.synchronize()
 
     fps, frames = _rate(move, len(chosen), wait)
-    instants = [model.instant(time, camera) for camera, time in chosen]
-    moved = [model.at(instant) for instant in instants]
+    moved = [show(model, model.instant(time, camera)) for camera, time in chosen]
 
     def rasterize(i: int) -> object:
-        return draw_moment(model, moved[i], instants[i], cameras[i], engine, background)
+        return draw_shown(moved[i], cameras[i], engine, background)
 
     fps_raster, _ = _rate(rasterize, len(chosen), wait)
     return Speed(fps, fps_raster, frames)

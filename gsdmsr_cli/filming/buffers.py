@@ -10,10 +10,11 @@ import torch
 from numpy.typing import NDArray
 
 from gsdmsr_cli.drawing.flow import draw_flow
-from gsdmsr_cli.drawing.splatting import draw_moment
+from gsdmsr_cli.drawing.splatting import Shown, draw_shown, show
 from gsdmsr_cli.evaluation.protocol import ViewRenderer
 from gsdmsr_cli.gaussians.moment import Moment
 from gsdmsr_cli.ground.splatting_constants import ALPHA_MIN
+from gsdmsr_cli.model.joined import Joined
 from gsdmsr_cli.model.layer import Instant
 from gsdmsr_cli.scene.camera import Camera
 from gsdmsr_cli.scene.film import Shot
@@ -68,23 +69,21 @@ class BufferRenderer:
         self._supersample = supersample
         self._with_depth = "depth" in outputs
         self._with_flow = "flow" in outputs
-        self._kept: tuple[Instant, Moment] | None = None
+        self._kept: tuple[Instant, Shown] | None = None
 
     @torch.no_grad()
     def draw(self, shot: Shot, following: Shot | None) -> Buffers:
         """Draw a shot; without a ``following`` one there is no flow."""
         renderer = self._renderer
         instant, camera = self._seen(shot)
-        moment = self._moment(instant)
-        frame = draw_moment(
-            renderer.model, moment, instant, camera, renderer.engine, renderer.background, None,
-            self._with_depth,
-        )  # fmt: skip
+        shown = self._shown(instant)
+        given = renderer.engine, renderer.background, None, self._with_depth
+        frame = draw_shown(shown, camera, *given)
         flow = None
         if self._with_flow and following is not None:
             next_instant, next_camera = self._seen(following)
-            later = self._moment(next_instant)
-            flow = draw_flow(moment, camera, later, next_camera, renderer.engine)
+            now, later = self._pair(shown, instant, next_instant)
+            flow = draw_flow(now, camera, later, next_camera, renderer.engine)
         depth = None if frame.depth is None else frame.depth.numpy(force=True)
         moved = None if flow is None else flow.numpy(force=True)
         return Buffers(frame.rgb.numpy(force=True), frame.alpha.numpy(force=True), depth, moved)
@@ -97,10 +96,22 @@ class BufferRenderer:
             return model.instant_of_view(shot.time, camera)
         return model.instant(shot.time, camera), camera
 
-    def _moment(self, instant: Instant) -> Moment:
+    def _shown(self, instant: Instant) -> Shown:
         if self._kept is None or self._kept[0] != instant:
-            self._kept = instant, self._renderer.model.at(instant)
+            self._kept = instant, show(self._renderer.model, instant)
         return self._kept[1]
+
+    def _pair(self, shown: Shown, instant: Instant, later: Instant) -> tuple[Moment, Moment]:
+        """Return the same splats at two instants: of segments, those of the one that counts most.
+
+        That one goes on to the later instant, or stops at its own end if that comes before.
+        """
+        model = self._renderer.model
+        if isinstance(model, Joined):
+            lead, within = model.lead(instant)
+            _, own = model.lead(instant, later)
+            return lead.at(within), lead.at(own)
+        return shown[0][1], self._shown(later)[0][1]
 
 
 def _shrunk(buffer: Floats, factor: int) -> Floats:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -28,6 +28,21 @@ MOVING = "motion.moving"
 
 MOTION, FURTHER = "motion", "layers."
 """Under which names a model's motion and its further layers stand and are saved."""
+
+
+@dataclass(frozen=True)
+class Share:
+    """A model that has part in a picture.
+
+    Attributes:
+        weight: of its picture in the mean.
+        model: which is drawn.
+        instant: at which it is drawn, in its own time.
+    """
+
+    weight: float
+    model: Model
+    instant: Instant
 
 
 class Model:
@@ -71,6 +86,11 @@ class Model:
     def trained(self) -> dict[str, Tensor]:
         """Return the tensors that follow a learning rate, by name."""
         return tensors_of(p for p in self._parameters if p.rate is not None)
+
+    @property
+    def steady(self) -> bool:
+        """Whether row i of what is drawn is the same splat at all times."""
+        return True
 
     @property
     def shades(self) -> bool:
@@ -161,6 +181,10 @@ class Model:
         if gradient_mask is None:
             return moments
         return [mask_gradients(canonical, moment, gradient_mask) for moment in moments]
+
+    def shares(self, instant: Instant) -> list[Share]:
+        """Return whose pictures make the picture of an instant, which is their weighted mean."""
+        return [Share(1.0, self, instant)]
 
     def canonical(self) -> Moment:
         """Return what the motion is given: the canonical splats after the layers before it."""

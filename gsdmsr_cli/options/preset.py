@@ -14,7 +14,7 @@ from typing import Any, Literal
 from gsdmsr_cli.backends.cuda.compiler import MOST_VIEWS
 from gsdmsr_cli.options import preset_files, strict
 from gsdmsr_cli.options.durations import require_duration
-from gsdmsr_cli.options.sequences import StreamOptions
+from gsdmsr_cli.options.sequences import SegmentOptions, StreamOptions
 from gsdmsr_cli.options.strict import (
     PROGRESS,
     require,
@@ -38,17 +38,22 @@ class DataOptions:
     Attributes:
         background: colour behind transparent pixels, in training and evaluation.
         downscale: both sides of every picture are divided by this whole number, by area.
+        between: times of the capture, 0 to 1, outside of which views are left out; the rest counts
+            from 0 to 1.
         cache_mib: memory for decoded pictures, halved pictures and masks that are kept, of all
             processes together [MiB]; 0 keeps none. On a GPU as much again for copies there.
     """
 
     background: Literal["white", "black"] = "white"
     downscale: int = 1
+    between: tuple[float, float] = (0.0, 1.0)
     cache_mib: int = 4096
 
     def __post_init__(self) -> None:
         require_at_least(self, 1, "downscale")
         require_at_least(self, 0, "cache_mib")
+        first, last = self.between
+        require(self, "between", 0 <= first < last <= 1, "[start, end], 0 <= start < end <= 1")
 
 
 @dataclass(frozen=True)
@@ -60,6 +65,8 @@ class SplatOptions:
             fewer than that.
         start: where they lie: "box" evenly in the scene's box, "silhouettes" where the silhouettes
             of the train views overlap, "surfaces" where neighbouring train views agree.
+        of_run: folder of a run whose canonical splats are taken as they are in place of all that;
+            null takes none.
         opacity: their opacity, between 0 and 1.
         sh_degree: highest degree of the spherical harmonics, 0 to 3.
         sh_start: progress at which degree 1 joins; higher degrees follow.
@@ -67,6 +74,7 @@ class SplatOptions:
 
     count: int = 2500
     start: Literal["box", "silhouettes", "surfaces"] = "silhouettes"
+    of_run: str | None = None
     opacity: float = 0.1
     sh_degree: int = 1
     sh_start: float = 0.3
@@ -332,6 +340,7 @@ class Preset:
     density: DensityOptions = field(default_factory=DensityOptions)
     saliency: SaliencyOptions = field(default_factory=SaliencyOptions)
     stream: StreamOptions = field(default_factory=StreamOptions)
+    segments: SegmentOptions = field(default_factory=SegmentOptions)
     motion: dict[str, Any] = field(default_factory=lambda: {"name": "multiscale"})
     layers: tuple[dict[str, Any], ...] = ()
     events: tuple[str | dict[str, Any], ...] = EVENTS

@@ -52,3 +52,31 @@ class StreamOptions:
         require(self, "extrapolate", 0.0 <= self.extrapolate <= 1.0, "0 to 1")
         for key in ("place_step", "turn_step"):
             require(self, key, 1e-7 <= getattr(self, key) <= 0.1, "1e-7 to 0.1")
+
+
+@dataclass(frozen=True)
+class SegmentOptions:
+    """Segments of time that are trained each by itself and joined, see ``scene.segments``.
+
+    Each takes ``training.steps`` or ``training.budget``.
+
+    Attributes:
+        count: how many segments of equal length there are; 1 leaves the time whole.
+        overlap: what each shares with the next, as a share of its length, 0 to below 0.5.
+        static_share: length of the training of what stands still, from the views of all times,
+            whose splats all segments begin with, as a share of a segment's; 0: they begin anew.
+    """
+
+    count: int = 1
+    overlap: float = 0.1
+    static_share: float = 0.25
+
+    def __post_init__(self) -> None:
+        require_at_least(self, 1, "count")
+        require(self, "overlap", 0.0 <= self.overlap < 0.5, "0 or more, below 0.5")
+        require(self, "static_share", 0.0 <= self.static_share <= 1.0, "a share from 0 to 1")
+
+    @property
+    def several(self) -> bool:
+        """Whether the time is cut at all."""
+        return self.count > 1

@@ -6,6 +6,7 @@
     RUN/checkpoint.safetensors   the last checkpoint, with its state as JSON in the header
     RUN/checkpoints/             earlier ones, if any are kept: step-001200.safetensors
     RUN/moments/                 of a stream: a file for each moment, see ``runs.moments``
+    RUN/segments/                where time is cut: a run for each segment, see ``runs.segments``
     RUN/training.json     how long the training took, on which machine
     RUN/torchrun.json     which call of torchrun has begun or resumed it, if one has
 
@@ -40,10 +41,20 @@ from gsdmsr_cli.model.model import Model
 from gsdmsr_cli.options import strict
 from gsdmsr_cli.options.preset import Preset
 from gsdmsr_cli.options.renamed import with_present_names
-from gsdmsr_cli.runs import checkpoints, earlier, log, moments, moving_file, seen_pictures, stream
+from gsdmsr_cli.runs import (
+    checkpoints,
+    earlier,
+    log,
+    moments,
+    moving_file,
+    seen_pictures,
+    segments,
+    stream,
+)
 from gsdmsr_cli.runs.checkpoints import LAST, SCHEMA, WRONG, Checkpoint
 from gsdmsr_cli.scene.picture_hashes import digest
 from gsdmsr_cli.scene.scene import Scene
+from gsdmsr_cli.scene.segments import Segment, between
 
 _READ = 1, SCHEMA
 _ABOUT, _LOG, _TRAINING = "run.json", "metrics.jsonl", "training.json"
@@ -188,8 +199,18 @@ class Run:
         if pictures.is_file():
             write_json(root / seen_pictures.PICTURES, read_json(pictures))
 
-    def check_scene(self, scene: Scene) -> None:
-        """Raise DataError unless the scene is the one that the run was trained on."""
+    def part_of(self, scene: Scene) -> Scene:
+        """Return what the run sees of the scene that it was trained on.
+
+        Raises:
+            DataError: it is another scene.
+        """
+        part = between(scene, Segment(*self.preset.data.between))
+        self.check_part(part)
+        return part
+
+    def check_part(self, scene: Scene) -> None:
+        """Raise DataError unless the scene is what the run sees of that which it was trained on."""
         if scene.fingerprint != self.fingerprint:
             raise DataError(
                 f"{scene.root}: is not the data that {self.root} was trained on (its layout files "
@@ -225,6 +246,12 @@ class Run:
         """
         path = self.checkpoint_path
         if not self.has_checkpoint:
+            if self.preset.segments.several:
+                raise DataError(
+                    f"{self.root}: not all of its {self.preset.segments.count} segments are "
+                    f"trained; go on with train --resume, or name one, such as "
+                    f"{segments.folder_of(self.root, 0)}"
+                )
             raise DataError(
                 f"{self.root}: the run has no checkpoint yet; train it again with --overwrite"
             )
@@ -286,7 +313,10 @@ class Run:
         preset, progress = self.preset, checkpoint.progress
         given = preset.motion, preset.layers, self.facts, progress, preset.training.precision
         try:
-            model = load_model(checkpoint.tensors, *given)
+            if preset.segments.several:
+                model: Model = segments.load(self.root, checkpoint, preset)
+            else:
+                model = load_model(checkpoint.tensors, *given)
         except GsdmsrError as error:
             raise DataError(f"{self.root}: its model cannot be loaded: {error}") from error
         for tensor in model.tensors().values():
@@ -358,10 +388,12 @@ def create_run(
 def continue_run(run: Run, preset: Preset, scene: Scene) -> Run:
     """Return the run with other options, and with its scene at another place; both written down.
 
+    ``scene`` is what the run sees of it, see ``Run.part_of``.
+
     Raises:
         DataError: the scene is not the run's, or the folder cannot be written.
     """
-    run.check_scene(scene)
+    run.check_part(scene)
     remove_leftovers(run.root)  # a killed training was writing them
     continued = replace(run, preset=preset, data=scene.root.resolve())
     continued.describe()
@@ -431,6 +463,7 @@ def _clear(root: Path) -> None:
     """
     remove_leftovers(root)
     moments.rewind(root, 0)
+    segments.remove(root)
     checkpoints.remove(root)
     for name in (_LOG, _TRAINING, _JOB, seen_pictures.PICTURES):
         (root / name).unlink(missing_ok=True)

@@ -25,6 +25,8 @@ class Request:
         verify: take hashes of whole pictures, which a resumed training compares.
         tensorboard: hand the reports to TensorBoard.
         wandb: project of Weights & Biases that gets them, or None.
+        jobs: segments that are trained side by side.
+        workers: of Ray, that train them, see ``calling.on_ray.connected``; None trains them here.
         view_port: of the page that shows the training, 0 for a free one; None serves none.
 
     Raises:
@@ -44,7 +46,11 @@ class Request:
     tensorboard: bool = False
     wandb: str | None = None
     view_port: int | None = None
+    jobs: int = 1
+    workers: str | None = None
 
     def __post_init__(self) -> None:
         if self.resume and self.overwrite:
             raise UsageError("--resume and --overwrite are both given; drop one")
+        if self.jobs > 1 and self.workers is not None:
+            raise UsageError("--jobs and --workers are both given; drop one")

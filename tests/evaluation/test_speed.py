@@ -31,6 +31,9 @@ class Stage:
     def instant(self, time: float, camera: Camera) -> Instant:
         return Instant(time, camera)
 
+    def shares(self, instant: Instant) -> Any:
+        return [SimpleNamespace(weight=1.0, model=self, instant=instant)]
+
     def at(self, instant: Instant) -> Any:
         assert not torch.is_grad_enabled()
         self.now += MOVE_S

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from gsdmsr_cli.gaussians.fading import MOST, fade
+from gsdmsr_cli.gaussians.fading import MOST, fade, thin
 
 LOGITS = torch.tensor([-30.0, -4.0, 0.0, 3.0, 20.0, 60.0], dtype=torch.float64)
 EXPONENTS = torch.tensor([0.0, 1e-9, 0.3, 2.0, 40.0], dtype=torch.float64)
@@ -43,3 +43,16 @@ def test_what_is_beyond_all_bounds_stays_finite_and_so_do_its_gradients() -> Non
     for tensor in (found, logits.grad, exponents.grad):
         assert tensor is not None and tensor.isfinite().all()
     assert found[2:4].tolist() == pytest.approx([-MOST, -MOST], rel=0.01)
+
+
+@pytest.mark.parametrize("share", [0.7, 0.5, 1e-3])
+def test_shares_of_a_splat_let_through_what_it_does(share: float) -> None:
+    one, other = (torch.sigmoid(-thin(LOGITS, own)) for own in (share, 1 - share))
+    torch.testing.assert_close(one * other, torch.sigmoid(-LOGITS), rtol=1e-9, atol=0)
+
+
+def test_a_share_of_nothing_and_of_all_stays_finite() -> None:
+    logits = torch.tensor([-1e6, -80.0, 0.0, 80.0, 1e6])
+    for share in (1.0, 0.5, 1e-12):
+        assert thin(logits, share).isfinite().all()
+    torch.testing.assert_close(thin(LOGITS.float(), 1.0), LOGITS.float(), rtol=1e-6, atol=1e-6)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
+from pathlib import Path
 
 import torch
 from torch import Tensor
@@ -13,6 +15,7 @@ from gsdmsr_cli.model.layer import Facts
 from gsdmsr_cli.ops.neighbours.cpu import mean_squares
 from gsdmsr_cli.ops.planes import Box, Corner
 from gsdmsr_cli.options.preset import SplatOptions
+from gsdmsr_cli.runs.run import open_with_model
 from gsdmsr_cli.scene.pictures import Pictures
 from gsdmsr_cli.scene.scene import Scene
 from gsdmsr_cli.training.starting import silhouettes, surfaces
@@ -40,8 +43,15 @@ def initial_splats(
     They sit at the scene's own points, or at ``most`` of them chosen at random. Where there are
     none, or the start is "surfaces" and there are fewer than ``options.count``, others join them as
     ``options.start`` says: at random in the box and nearly grey, as all methods do on D-NeRF; where
-    silhouettes overlap; or on surfaces.
+    silhouettes overlap; or on surfaces. Those of the run ``options.of_run`` stand in place of all
+    these, as they are.
+
+    Raises:
+        DataError: that run cannot be used.
     """
+    if options.of_run is not None:
+        splats = of_run(Path(options.of_run), options.sh_degree)
+        return splats, torch.full((len(splats),), math.nan)
     given = _given_points(scene, pictures, most, generator)
     wanted = min(options.count, most) - len(given.means)
     if not len(given.means) or (options.start == "surfaces" and wanted > 0):
@@ -61,6 +71,21 @@ def initial_splats(
         sh=sh,
     )
     return splats, times
+
+
+def of_run(folder: Path, sh_degree: int) -> Splats:
+    """Return the canonical splats of a run, with harmonics of another degree: cut, or 0 beyond.
+
+    Raises:
+        DataError: the run cannot be used.
+    """
+    _, model, _ = open_with_model(folder)
+    splats = model.canonical().splats.detach().map(torch.clone)
+    wanted = (sh_degree + 1) ** 2
+    sh = torch.nn.functional.pad(
+        splats.sh[:, :wanted], (0, 0, 0, max(0, wanted - splats.sh.shape[1]))
+    )
+    return replace(splats, sh=sh.contiguous())
 
 
 def _given_points(

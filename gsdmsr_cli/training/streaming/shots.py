@@ -57,6 +57,11 @@ def check_options(preset: Preset) -> None:
             f"splats.sh_start is {start:g}; allowed with --stream: 0, since progress begins anew "
             "at each moment and colours would"
         )
+    if preset.segments.several:
+        raise UsageError(
+            f"segments.count is {preset.segments.count}; allowed with --stream: 1, since a stream "
+            "is cut into moments"
+        )
     if preset.saliency.gate != "none":
         raise UsageError(f"saliency.gate is {preset.saliency.gate}; allowed with --stream: none")
 
