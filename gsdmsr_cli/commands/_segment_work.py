@@ -59,8 +59,13 @@ class Work:
 
     @property
     def root(self) -> Path:
-        """The run folder that joins all."""
-        return self.request.out
+        """The run folder that joins all; absolute, as workers elsewhere want it."""
+        return self.request.out.absolute()
+
+    @property
+    def data(self) -> Path:
+        """Folder of the capture, likewise."""
+        return self.request.data.absolute()
 
     @cached_property
     def segments(self) -> list[Segment]:
@@ -124,7 +129,7 @@ class Work:
     def _start(self) -> list[str]:
         if not self.options.segments.static_share:
             return []
-        return [f"splats.of_run={json.dumps(str(parts.static_of(self.root).resolve()))}"]
+        return [f"splats.of_run={json.dumps(str(parts.static_of(self.root)))}"]
 
     def _left(self, folder: Path, length: Sequence[str], own: Sequence[str]) -> Iterator[Line]:
         run = open_run(folder) if is_run(folder) else None
@@ -136,7 +141,7 @@ class Work:
             if is_complete(run, run.load_whole()[0], training):
                 return
         request = self.request
-        places = ["train", "--data", str(request.data), "--out", str(folder)]
+        places = ["train", "--data", str(self.data), "--out", str(folder)]
         given = [*length, f"training.threads={self.threads}"]
         if begun:
             given += [text for text in own if text.startswith("splats.of_run=")]

@@ -84,9 +84,8 @@ def train_cut(request: Request) -> None:
             say.note(f"interrupted; continue with: {shlex.join([*again, '--resume'])}")
             raise
         account = _join(work)
-    folder = work.root
-    text = f"trained {len(work.segments)} segments to {account['splats']} splats: {folder}"
-    say.note(text)
+    splats, folder = account["splats"], request.out
+    say.note(f"trained {len(work.segments)} segments to {splats} splats: {folder}")
     say.result({"run": str(folder), "preset": work.name, "reason": work.reason, **account})
 
 
@@ -147,7 +146,7 @@ def _call(works: _Works, work: Work) -> None:
     """Run what is left of some parts: one by one in view, side by side, or on workers of Ray."""
     request = work.request
     if request.workers is not None:
-        with connected(request.workers) as ray, needs_of(work.root, [request.data]) as needs:
+        with connected(request.workers) as ray, needs_of(work.root, [work.data]) as needs:
             require_workers(ray, needs)
             call_on_ray(ray, works, work.threads, needs, lambda log: say.note(f"ended: {log}"))
     elif request.jobs > 1:

@@ -38,12 +38,17 @@ WIDER = 2
 take turns, every second one is of the same."""
 
 
+ALWAYS = -1.0
+"""In place of the time of a row that is a fixed camera's at all times."""
+
+
 @dataclass(frozen=True, eq=False)
 class ViewRows:
-    """The train views of a capture, and the row of each.
+    """The train views of a capture, or its fixed cameras, and the row of each.
 
     Attributes:
-        times: (V,) float64 in [0, 1].
+        times: (V,) float64 in [0, 1]; ``ALWAYS`` of fixed cameras, which earlier versions had once
+            for each of their views.
         poses: (V, 4, 4) float64, world to camera.
         rows: (V,) int64, which row belongs to each.
         bound: of the scene [world units].
@@ -64,8 +69,8 @@ class ViewRows:
 
     @property
     def per_camera(self) -> bool:
-        """Whether views share rows, which are then those of fixed cameras."""
-        return self.count < len(self.rows)
+        """Whether rows are those of fixed cameras."""
+        return bool((self.times == ALWAYS).any()) or self.count < len(self.rows)
 
     def centres(self) -> NDArray[np.float64]:
         """Return where the camera of each row stands, (rows, 3); of several the first."""
@@ -153,14 +158,16 @@ class ViewRows:
 
 
 def rows_of(views: Sequence[tuple[Camera, float]], per: Per, bound: float, beside: int) -> ViewRows:
-    """Return the rows of train views, given as camera and time; see ``ViewRows``."""
+    """Return the rows of train views, given as camera and time."""
     times = np.array([time for _, time in views], np.float64)
     poses = np.stack([camera.world_to_camera for camera, _ in views])
     cameras = _grouped(poses, bound)
     fixed = int(cameras.max()) + 1
     rig = fixed >= 2 and 2 * fixed <= len(views)
     if per == "camera" or (per == "auto" and rig):
-        return ViewRows(times, poses, cameras, bound, beside)
+        _, firsts = np.unique(cameras, return_index=True)
+        always = np.full(fixed, ALWAYS)
+        return ViewRows(always, poses[firsts], np.arange(fixed), bound, beside)
     return ViewRows(times, poses, np.arange(len(views)), bound, beside)
 
 

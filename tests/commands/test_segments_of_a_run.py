@@ -136,6 +136,16 @@ def test_side_by_side_they_become_the_same(
     assert (folder_of(other, 0).with_name("000.log")).is_file()
 
 
+def test_on_workers_of_ray_they_become_the_same(
+    run: Path, rig: Path, tmp_path: Path, gsdmsr: Gsdmsr
+) -> None:
+    pytest.importorskip("ray", reason="pip install 'gsdmsr[ray]'")
+    other = tmp_path / "other"
+    words = "train", "--data", rig, "--out", other, *GIVEN
+    assert gsdmsr(*words, "--workers", 2) == 0
+    assert_same(run, other)
+
+
 def test_what_is_finished_is_not_done_again(
     run: Path, rig: Path, gsdmsr: Gsdmsr, monkeypatch: pytest.MonkeyPatch
 ) -> None:

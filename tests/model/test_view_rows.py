@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from gsdmsr_cli.model.view_rows import rows_of
+from gsdmsr_cli.model.view_rows import ViewRows, rows_of
 from gsdmsr_cli.scene.camera import Camera, look_at
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -81,7 +81,20 @@ def test_a_rigs_cameras_have_a_row_each_at_all_times() -> None:
     assert rows.count == 3 and rows.per_camera
     assert rows.weights(camera_at(0.1), 0.77) == ((1, 1.0),)
     assert rows.centres().shape == (3, 3)
+    assert len(rows.poses) == 3  # and not one for each of the pictures
     assert rows_of(rig(), "frame", 1.0, 1).count == 15
+
+
+def test_a_camera_of_an_earlier_version_has_its_row_by_any_of_its_views() -> None:
+    views = rig()
+    times = np.array([time for _, time in views])
+    poses = np.stack([camera.world_to_camera for camera, _ in views])
+    numbers = rows_of(views, "auto", 1.0, 1)
+    each = np.array([numbers.own(*view) for view in views])
+    earlier = ViewRows(times, poses, each, 1.0)
+    assert earlier.per_camera
+    for camera in (camera_at(0.1), camera_at(0.05)):
+        assert earlier.weights(camera, 0.77) == numbers.weights(camera, 0.77)
 
 
 def test_one_fixed_camera_is_no_rig() -> None:
