@@ -21,7 +21,7 @@ from gsdmsr_cli.runs.outputs import OUTPUTS
 from gsdmsr_cli.runs.run import Run, continue_run, create_run, is_run, open_run, refuse_used
 from gsdmsr_cli.runs.seen_pictures import check_whole
 from gsdmsr_cli.scene.scene import Scene
-from gsdmsr_cli.scene.segments import Segment, between
+from gsdmsr_cli.scene.segments import between
 from gsdmsr_cli.training.request import Request
 from gsdmsr_cli.training.schedule import new_clock
 from gsdmsr_cli.training.streaming.trainer import StreamTrainer
@@ -79,7 +79,7 @@ class Anew:
         self.options, self.name, self.reason = chosen.options, chosen.name, chosen.reason
         if self.reason is not None:
             say.note(f"{self.reason}; --preset names another")
-        return between(scene, Segment(*self.options.data.between))
+        return between(scene, *self.options.data.between)
 
     def restore(self, trainer: Trainer) -> None:
         """Leave the training as it is: at its first step."""

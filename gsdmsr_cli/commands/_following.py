@@ -9,7 +9,7 @@ from gsdmsr_cli.ground import say
 from gsdmsr_cli.ground.locks import one_of_readers
 from gsdmsr_cli.options.preset import Preset
 from gsdmsr_cli.scene.scene import Scene
-from gsdmsr_cli.scene.segments import Segment, between
+from gsdmsr_cli.scene.segments import between
 from gsdmsr_cli.training import loop
 from gsdmsr_cli.training.request import Request
 
@@ -32,7 +32,7 @@ def follow(request: Request, party: Party) -> None:
             return
         options: Preset = party.tell(None)
         with party.all_or_none():
-            scene = between(scene, Segment(*options.data.between))
+            scene = between(scene, *options.data.between)
             party.require_same(scene)
         _make_steps(scene, options, request, party, device)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -89,7 +89,7 @@ class Work:
         """Return how many distinct times of train views lie in a segment."""
         return sum(map(segment.holds, self.scene.train_times))
 
-    def opened(self) -> Work:
+    def open_folder(self) -> None:
         """Make the run folder, or describe it anew, and write the options of the parts.
 
         Raises:
@@ -108,12 +108,11 @@ class Work:
         document = {"base": "default", **strict.dump(self.options)}
         self.config.parent.mkdir(exist_ok=True)
         write_text(self.config, yaml.dump(document, Dumper=_Dumper, sort_keys=False))
-        return self
 
     def left_of_static(self) -> Iterator[Line]:
         """Yield the command that is left of the training of what stands still, if any is."""
         share = self.options.segments.static_share
-        length = _length(self.options.training, share)
+        length = shortened(self.options.training, share)
         still = ["training.static_until=1", f"training.static_steps={_FOR_EVER}"]
         yield from self._left(parts.static_of(self.root), length, [*still, "training.window=1"])
 
@@ -122,27 +121,22 @@ class Work:
         segment, (first, last) = self.segments[number], self.options.data.between
         ends = [first + end * (last - first) for end in (segment.start, segment.end)]
         own = [f"data.between={ends}", *self._start()]
-        yield from self._left(
-            parts.folder_of(self.root, number), _length(self.options.training), own
-        )
+        yield from self._left(parts.folder_of(self.root, number), self.options.training, own)
 
     def _start(self) -> list[str]:
         if not self.options.segments.static_share:
             return []
         return [f"splats.of_run={json.dumps(str(parts.static_of(self.root)))}"]
 
-    def _left(self, folder: Path, length: Sequence[str], own: Sequence[str]) -> Iterator[Line]:
+    def _left(self, folder: Path, length: TrainingOptions, own: Sequence[str]) -> Iterator[Line]:
         run = open_run(folder) if is_run(folder) else None
         begun = run is not None and run.has_checkpoint
-        if run is not None and begun:
-            training = strict.build(
-                TrainingOptions, strict.dump(run.preset.training) | _values(length), "training"
-            )
-            if is_complete(run, run.load_whole()[0], training):
-                return
+        if run is not None and begun and is_complete(run, run.load_whole()[0], length):
+            return
         request = self.request
         places = ["train", "--data", str(self.data), "--out", str(folder)]
-        given = [*length, f"training.threads={self.threads}"]
+        given = [f"training.budget={json.dumps(length.budget)}", f"training.steps={length.steps}"]
+        given += [f"training.threads={self.threads}"]
         if begun:
             given += [text for text in own if text.startswith("splats.of_run=")]
         else:
@@ -156,15 +150,9 @@ class Work:
         yield [*places, *settings, *further]
 
 
-def _length(training: TrainingOptions, share: float = 1.0) -> list[str]:
-    """Return the length of a training, or a share of it, as ``--set`` takes it."""
-    steps = max(1, round(training.steps * share))
-    if training.budget is None:
-        return ["training.budget=null", f"training.steps={steps}"]
-    seconds = parse_duration(training.budget) * share
-    return [f"training.budget={json.dumps(f'{seconds:.12g}s')}", f"training.steps={steps}"]
-
-
-def _values(length: Sequence[str]) -> dict[str, Any]:
-    pairs = (text.removeprefix("training.").split("=", 1) for text in length)
-    return {key: json.loads(value) for key, value in pairs}
+def shortened(training: TrainingOptions, share: float) -> TrainingOptions:
+    """Return options of a training with a share of the length."""
+    steps, budget = max(1, round(training.steps * share)), training.budget
+    if budget is not None:
+        budget = f"{parse_duration(budget) * share:.12g}s"
+    return replace(training, steps=steps, budget=budget)

@@ -76,7 +76,7 @@ def train_cut(request: Request) -> None:
             return
         if not there:
             held.enter_context(sole_writer(request.out))
-        work = work.opened()
+        work.open_folder()
         try:
             _train(work)
         except KeyboardInterrupt:

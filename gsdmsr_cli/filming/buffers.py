@@ -82,7 +82,7 @@ class BufferRenderer:
         flow = None
         if self._with_flow and following is not None:
             next_instant, next_camera = self._seen(following)
-            now, later = self._pair(shown, instant, next_instant)
+            now, later = self._pair(instant, next_instant)
             flow = draw_flow(now, camera, later, next_camera, renderer.engine)
         depth = None if frame.depth is None else frame.depth.numpy(force=True)
         moved = None if flow is None else flow.numpy(force=True)
@@ -101,17 +101,17 @@ class BufferRenderer:
             self._kept = instant, show(self._renderer.model, instant)
         return self._kept[1]
 
-    def _pair(self, shown: Shown, instant: Instant, later: Instant) -> tuple[Moment, Moment]:
+    def _pair(self, instant: Instant, later: Instant) -> tuple[Moment, Moment]:
         """Return the same splats at two instants: of segments, those of the one that counts most.
 
         That one goes on to the later instant, or stops at its own end if that comes before.
         """
         model = self._renderer.model
+        _, now = max(self._shown(instant), key=lambda one: one[0].weight)
         if isinstance(model, Joined):
-            lead, within = model.lead(instant)
-            _, own = model.lead(instant, later)
-            return lead.at(within), lead.at(own)
-        return shown[0][1], self._shown(later)[0][1]
+            lead, own = model.lead(instant, later)
+            return now, lead.at(own)
+        return now, self._shown(later)[0][1]
 
 
 def _shrunk(buffer: Floats, factor: int) -> Floats:

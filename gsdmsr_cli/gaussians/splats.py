@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 
 import torch
@@ -69,6 +69,12 @@ class Splats:
     def detach(self) -> Splats:
         """Return the same values outside the autograd graph."""
         return self.map(torch.Tensor.detach)
+
+
+def together(parts: Sequence[Splats]) -> Splats:
+    """Return the rows of several splats, one after the other."""
+    columns = [part.tensors() for part in parts]
+    return Splats(**{name: torch.cat([column[name] for column in columns]) for name in NAMES})
 
 
 NAMES = tuple(field.name for field in fields(Splats))

@@ -14,6 +14,7 @@ from gsdmsr_cli.model import layers as further
 from gsdmsr_cli.model import motion as motions
 from gsdmsr_cli.model.layer import Facts, Layer, options_of, start_layer
 from gsdmsr_cli.model.model import FURTHER, MOTION, MOVING, STORED_AS, Model
+from gsdmsr_cli.model.parameter import below
 from gsdmsr_cli.scene.camera import Camera
 
 
@@ -97,9 +98,8 @@ def load_model(
     Raises:
         DataError: a tensor is missing, or does not fit to the others or to the settings.
     """
-    stored = {k: v for k, v in tensors.items() if k.startswith(STORED_AS)}
     try:
-        splats = Splats(**{name.removeprefix(STORED_AS): t for name, t in stored.items()})
+        splats = Splats(**below(STORED_AS, tensors))
     except (TypeError, ValueError) as error:
         raise DataError(f"the checkpoint's splats cannot be used: {error}") from error
     moving = int(tensors[MOVING]) if MOVING in tensors else len(splats)

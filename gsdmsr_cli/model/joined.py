@@ -12,7 +12,7 @@ from torch import Tensor
 
 from gsdmsr_cli.gaussians.fading import thin
 from gsdmsr_cli.gaussians.moment import Moment
-from gsdmsr_cli.gaussians.splats import Splats
+from gsdmsr_cli.gaussians.splats import together
 from gsdmsr_cli.model.layer import Instant
 from gsdmsr_cli.model.model import Model, Share
 from gsdmsr_cli.scene.camera import Camera
@@ -48,7 +48,7 @@ class Joined(Model):
     def __init__(self, segments: Sequence[Segment], models: Sequence[Model]) -> None:
         self.segments, self.models = tuple(segments), tuple(models)
         layers = {f"{i}.{key}": own for i, m in enumerate(models) for key, own in m.layers.items()}
-        super().__init__(_together([model.splats for model in models]), layers)
+        super().__init__(together([model.splats for model in models]), layers)
         self.moving = sum(model.moving for model in models)
 
     @property
@@ -137,12 +137,6 @@ class Joined(Model):
         return _blend([(share.weight, share.model.at(share.instant)) for share in shares])
 
 
-def _together(splats: Sequence[Splats]) -> Splats:
-    """Return the rows of several splats, one after the other."""
-    columns = [each.tensors() for each in splats]
-    return Splats(**{name: torch.cat([each[name] for each in columns]) for name in columns[0]})
-
-
 def _blend(shares: Sequence[tuple[float, Moment]]) -> Moment:
     """Return the rows of several moments, those of each with its share of the optical depth."""
     thinned = []
@@ -150,7 +144,7 @@ def _blend(shares: Sequence[tuple[float, Moment]]) -> Moment:
         logits = thin(moment.splats.logit_opacities, weight)
         thinned.append(replace(moment.splats, logit_opacities=logits))
     further = (_beside([getattr(m, name) for _, m in shares]) for name in ("axes", "features"))
-    return Moment(_together(thinned), *further)
+    return Moment(together(thinned), *further)
 
 
 def _beside(tensors: Sequence[Tensor | None]) -> Tensor | None:

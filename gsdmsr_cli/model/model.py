@@ -15,7 +15,7 @@ from gsdmsr_cli.gaussians.splats import NAMES, Splats
 from gsdmsr_cli.ground.errors import DataError
 from gsdmsr_cli.model.folding import apply, join, mask_gradients, split
 from gsdmsr_cli.model.layer import Instant, Layer
-from gsdmsr_cli.model.parameter import Parameter, tensors_of
+from gsdmsr_cli.model.parameter import Parameter, below, tensors_of
 from gsdmsr_cli.ops.precision import computing_in
 from gsdmsr_cli.scene.camera import Camera
 
@@ -351,10 +351,8 @@ class Model:
             DataError: a tensor is missing, or does not fit.
         """
         for key, layer in self.layers.items():
-            start = f"{key}."
-            own = {n.removeprefix(start): t for n, t in tensors.items() if n.startswith(start)}
             try:
-                layer.restore(own, self._rows(layer))
+                layer.restore(below(f"{key}.", tensors), self._rows(layer))
             except ValueError as error:
                 raise DataError(f"the checkpoint holds {error}") from error
 

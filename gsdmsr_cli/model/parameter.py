@@ -95,6 +95,11 @@ def tensors_of(parameters: Iterable[Parameter]) -> dict[str, Tensor]:
     return {parameter.name: parameter.tensor for parameter in parameters}
 
 
+def below(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Return the tensors whose names begin with the prefix, without it."""
+    return {n.removeprefix(prefix): t for n, t in tensors.items() if n.startswith(prefix)}
+
+
 class Part(Protocol):
     """A level of a grid or a layer of a network: a named tuple of tensors."""
 

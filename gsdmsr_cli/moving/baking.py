@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from gsdmsr_cli.gaussians.moment import Moment
-from gsdmsr_cli.gaussians.splats import Splats
+from gsdmsr_cli.gaussians.splats import Splats, together
 from gsdmsr_cli.ground.errors import DataError
 from gsdmsr_cli.ground.geometry import quat_product
 from gsdmsr_cli.ground.splatting_constants import ALPHA_MIN
@@ -26,7 +26,6 @@ from gsdmsr_cli.moving.looking import (
     add,
     at,
     in_the_mean,
-    joined,
     look,
     stacked,
     without_lives,
@@ -61,7 +60,7 @@ def bake(model: Model, frames: int, least_opacity: float = ALPHA_MIN) -> Baked:
     samples, still = look(model, times, moving)
     samples = without_lives(samples, lives, times)
     splats = _canonical(model, moving) if following is not None else in_the_mean(samples)
-    splats = joined(splats, still)
+    splats = together([splats, still])
     _require_finite(splats, samples)
     quats, turns = upright(splats.quats)
     splats = replace(splats, quats=quats)

@@ -77,9 +77,3 @@ def in_the_mean(samples: Samples) -> Splats:
     logits = opacities[:, 0].clamp(UNSEEN, 1 - UNSEEN).logit()
     quats = torch.where(gone, middle, quats)
     return Splats(means, quats, log_scales, logits, sh.unflatten(1, (-1, 3)))
-
-
-def joined(moving: Splats, still: Splats) -> Splats:
-    """Return all of the splats, those that move first."""
-    pairs = zip(moving.tensors().items(), still.tensors().values(), strict=True)
-    return Splats(**{name: torch.cat([first, second]) for (name, first), second in pairs})

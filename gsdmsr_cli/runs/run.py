@@ -54,7 +54,7 @@ from gsdmsr_cli.runs import (
 from gsdmsr_cli.runs.checkpoints import LAST, SCHEMA, WRONG, Checkpoint
 from gsdmsr_cli.scene.picture_hashes import digest
 from gsdmsr_cli.scene.scene import Scene
-from gsdmsr_cli.scene.segments import Segment, between
+from gsdmsr_cli.scene.segments import between
 
 _READ = 1, SCHEMA
 _ABOUT, _LOG, _TRAINING = "run.json", "metrics.jsonl", "training.json"
@@ -205,7 +205,7 @@ class Run:
         Raises:
             DataError: it is another scene.
         """
-        part = between(scene, Segment(*self.preset.data.between))
+        part = between(scene, *self.preset.data.between)
         self.check_part(part)
         return part
 

@@ -18,6 +18,7 @@ from gsdmsr_cli.model.building import load_model
 from gsdmsr_cli.model.joined import Joined, name_in
 from gsdmsr_cli.model.layer import Facts
 from gsdmsr_cli.model.model import MOVING, Model
+from gsdmsr_cli.model.parameter import below
 from gsdmsr_cli.options import strict
 from gsdmsr_cli.options.preset import Preset
 from gsdmsr_cli.runs.checkpoints import WRONG, Checkpoint
@@ -92,7 +93,7 @@ def load(root: Path, checkpoint: Checkpoint, preset: Preset) -> Joined:
         segments = [Segment(float(each["start"]), float(each["end"])) for each in told]
         models = [
             load_model(
-                _own(checkpoint, i),
+                below(name_in(i, ""), checkpoint.tensors),
                 preset.motion,
                 preset.layers,
                 strict.build(Facts, each["facts"], "facts"),
@@ -104,12 +105,3 @@ def load(root: Path, checkpoint: Checkpoint, preset: Preset) -> Joined:
     except WRONG as error:
         raise DataError(f"{root}: damaged: {error}; go on with train --resume") from error
     return Joined(segments, models)
-
-
-def _own(checkpoint: Checkpoint, number: int) -> dict[str, Any]:
-    start = name_in(number, "")
-    return {
-        name.removeprefix(start): tensor
-        for name, tensor in checkpoint.tensors.items()
-        if name.startswith(start)
-    }

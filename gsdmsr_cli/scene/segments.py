@@ -64,12 +64,13 @@ def weights(time: float, segments: Sequence[Segment]) -> dict[int, float]:
     return {i: weight for i, weight in found.items() if weight > 0}
 
 
-def between(scene: Scene, segment: Segment) -> Scene:
-    """Return the views of a segment, whose times count from 0 at its start to 1 at its end.
+def between(scene: Scene, start: float, end: float) -> Scene:
+    """Return the views from a time to another, which count from 0 at the first to 1 at the last.
 
     Raises:
-        DataError: no train view lies in it.
+        DataError: no train view lies there.
     """
+    segment = Segment(start, end)
     if segment == Segment(0.0, 1.0):
         return scene
     views = tuple(

@@ -7,9 +7,8 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from gsdmsr_cli.model.parameter import take_rows
+from gsdmsr_cli.model.parameter import below, take_rows
 from gsdmsr_cli.ops.adam import Gate, Move, adam_steps
-from gsdmsr_cli.training.state import below
 
 _FIRST, _SECOND = "first.", "second."
 

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from gsdmsr_cli.model.model import MOVING, Model
+from gsdmsr_cli.model.parameter import below
 from gsdmsr_cli.runs.checkpoints import Checkpoint
 from gsdmsr_cli.training.averaging import Average
 from gsdmsr_cli.training.gradients.tiles import TileSampler
@@ -17,7 +18,7 @@ from gsdmsr_cli.training.population import Event
 from gsdmsr_cli.training.resizing import Population
 from gsdmsr_cli.training.saliency import Saliency
 from gsdmsr_cli.training.schedule import Clock
-from gsdmsr_cli.training.state import Part, below, gather, scatter
+from gsdmsr_cli.training.state import Part, gather, scatter
 
 _LAST = "last."
 """Before the names of the model's last values, where a checkpoint's model is an average."""

@@ -7,6 +7,8 @@ from typing import Protocol
 
 from torch import Tensor
 
+from gsdmsr_cli.model.parameter import below
+
 
 class Part(Protocol):
     """Something that a training keeps beside its model."""
@@ -27,8 +29,3 @@ def scatter(parts: Mapping[str, Part], tensors: Mapping[str, Tensor]) -> None:
     """Restore all parts from what ``gather`` returned, perhaps among others."""
     for prefix, part in parts.items():
         part.restore(below(prefix, tensors))
-
-
-def below(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Return the tensors whose names begin with the prefix, without it."""
-    return {n.removeprefix(prefix): t for n, t in tensors.items() if n.startswith(prefix)}

@@ -74,8 +74,8 @@ def test_times_beyond_the_ends_are_those_of_the_ends() -> None:
 def test_a_scene_is_cut(tmp_path: Path) -> None:
     scene = read_scene(write_dnerf(tmp_path, train=5, val=2, test=3))
     scene = replace(scene, duration=8.0)
-    assert between(scene, Segment(0.0, 1.0)) is scene
-    part = between(scene, Segment(0.25, 0.75))
+    assert between(scene, 0.0, 1.0) is scene
+    part = between(scene, 0.25, 0.75)
     assert [view.time for view in part.split("train")] == pytest.approx([0, 0.5, 1])
     assert [view.name for view in part.split("train")] == [
         view.name for view in scene.split("train")[1:4]
@@ -83,4 +83,4 @@ def test_a_scene_is_cut(tmp_path: Path) -> None:
     assert [view.time for view in part.split("test")] == pytest.approx([0.5])
     assert part.duration == pytest.approx(4)
     with pytest.raises(DataError, match=r"no train view lies between 0\.3 and 0\.4 of its time"):
-        between(scene, Segment(0.3, 0.4))
+        between(scene, 0.3, 0.4)
