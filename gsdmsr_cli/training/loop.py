@@ -284,7 +284,9 @@ def _share(rows: Tensor) -> float:
 def _ctrl_c(patient: bool) -> Iterator[threading.Event]:
     """Turn Ctrl-C into an event, so that a step is finished; a second Ctrl-C does interrupt.
 
-    It does not where one is ``patient``, as ranks are: torchrun signals twice, and kills later.
+    It does not where one is ``patient``, as ranks are: torchrun signals twice, and kills later. Its
+    second signal can come after the last step, and would take from the process what it tells then;
+    so a patient one that was signalled stays so.
     """
     wanted = threading.Event()
     if threading.current_thread() is not threading.main_thread():
@@ -301,4 +303,5 @@ def _ctrl_c(patient: bool) -> Iterator[threading.Event]:
     try:
         yield wanted
     finally:
-        signal.signal(signal.SIGINT, earlier)
+        if not (patient and wanted.is_set()):
+            signal.signal(signal.SIGINT, earlier)

@@ -82,7 +82,8 @@ def test_only_what_is_ours_is_removed(
     assert answer(capsys)["removed"] == []
 
 
-def test_the_kernels_of_this_version_are_where_it_looks() -> None:
+def test_the_kernels_of_this_version_are_where_it_looks(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("NUMBA_CACHE_DIR")  # by it, a user puts them elsewhere
     folder = jit._cache_folder()
     assert folder.parent in (jit.HERE / "__pycache__", cache.cache_home())
     assert cache._NAME.fullmatch(folder.name)

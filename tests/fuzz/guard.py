@@ -62,7 +62,7 @@ class _Watch:
     def _opened(self, path: Any, mode: Any, flags: Any) -> None:
         if isinstance(path, int):
             return
-        name = os.path.realpath(os.fsdecode(path))  # noqa: PTH
+        name = os.path.realpath(os.fsdecode(path))
         if flags & _WRITING:
             self.seen.append(f"{name!r} was opened for writing")
         elif not name.startswith((f"{self.folder}/", "/proc/", *_MODULES)):
