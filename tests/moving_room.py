@@ -136,16 +136,75 @@ def write_capture(
         name = _write(folder, f"test{i:03d}", *_shot(camera, time))
         written["test"].append(f"images/{name}")
         entries.append(_entry(name, time, camera))
-    lists = {f"{split}_filenames": names for split, names in written.items()}
-    lens = {"fl_x": true[0].fx, "fl_y": true[0].fy, "cx": true[0].cx, "cy": true[0].cy}
-    sizes = {"w": width, "h": width * 3 // 4, "camera_model": "OPENCV"}
-    document = {**lens, **sizes, **lists, "frames": entries}
-    (folder / "transforms.json").write_text(json.dumps(document), encoding="utf-8")
-    described = {"gsdmsr": 1, "bound": float(SIZE.max())}
-    (folder / "scene.json").write_text(json.dumps(described), encoding="utf-8")
+    _write_layout(folder, written, entries, true[0])
     train = (~val).nonzero()[0]
     known = [true[i] for i in train], [given[i] for i in train], exposures[train]
     return Capture(*known, points=SEEN)
+
+
+def write_rig(folder: Path, width: int, moments: int, around: bool) -> None:
+    """Write what 16 cameras that stand still film, and as test pictures what three others do.
+
+    Args:
+        folder: is made.
+        width: of the pictures, four thirds of their height [px].
+        moments: evenly spaced.
+        around: whether they stand along the walls and look at the middle of the room; else they
+            are a panel on one side and look the same way, as the cameras of Neural 3D Video do.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    cameras = _ring(width) if around else _panel(width)
+    written: dict[str, list[str]] = {"train": [], "val": [], "test": []}
+    entries = []
+    for split, own in cameras.items():
+        for i, camera in enumerate(own):
+            for moment, time in enumerate(np.linspace(0, 1, moments)):
+                name = _write(folder, f"{split}{i:02d}_{moment:03d}", *_shot(camera, time))
+                written[split].append(f"images/{name}")
+                entries.append(_entry(name, time, camera))
+    _write_layout(folder, written, entries, cameras["train"][0])
+
+
+def _panel(width: int) -> dict[str, list[Camera]]:
+    rng = np.random.default_rng(0)
+    places = {"train": [(x, z) for x in (-0.9, -0.3, 0.3, 0.9) for z in (-0.5, -1 / 6, 1 / 6, 0.5)]}
+    places["test"] = [(0.0, 0.0), (0.6, 0.3), (-0.6, -0.3)]
+    found: dict[str, list[Camera]] = {}
+    for split, own in places.items():
+        shaken = 0.03 if split == "train" else 0.0
+        found[split] = [
+            _looking(
+                np.array([x, -1.6, z]) + shaken * rng.normal(size=3),
+                TARGET + np.array([0.4 * x, 0.0, 0.3 * z]),
+                width,
+            )
+            for x, z in own
+        ]
+    return found
+
+
+def _ring(width: int) -> dict[str, list[Camera]]:
+    middle = np.array([0.0, 0.6, -0.1])
+    places = {"train": [(2 * math.pi * k / 16, (-0.2, 0.6)[k % 2]) for k in range(16)]}
+    places["test"] = [(2 * math.pi * (5 * k + 0.5) / 16, 0.2) for k in range(3)]
+    return {
+        split: [_looking(_along_walls(turn, height), middle, width) for turn, height in own]
+        for split, own in places.items()
+    }
+
+
+def _along_walls(turn: float, height: float) -> Floats:
+    """Return a place within the walls, 2.6 m from the middle at most."""
+    way = np.array([math.cos(turn), math.sin(turn)])
+    with np.errstate(divide="ignore"):
+        reach = min(2.6, *(0.85 * SIZE[:2] / abs(way)))
+    return np.array([*(reach * way), height])
+
+
+def _looking(centre: Floats, target: Floats, width: int) -> Camera:
+    height, focal = width * 3 // 4, FOCAL * width
+    pose = np.linalg.inv(look_at(centre, target))
+    return Camera(pose, focal, focal, width / 2, height / 2, width, height)
 
 
 def seen_points(thing: Thing, time: float, count: int) -> Floats:
@@ -169,9 +228,7 @@ def on_path(time: float, width: int, aside: float = 0.0) -> Camera:
     turned = math.atan2(arm[2], level) + aside
     reach = math.hypot(level, arm[2])
     arm = np.array([*arm[:2] / level * reach * math.cos(turned), reach * math.sin(turned)])
-    pose = np.linalg.inv(look_at(TARGET + arm, target))
-    height = width * 3 // 4
-    return Camera(pose, FOCAL * width, FOCAL * width, width / 2, height / 2, width, height)
+    return _looking(TARGET + arm, target, width)
 
 
 def _walk(time: float) -> tuple[Floats, Floats]:
@@ -243,6 +300,19 @@ def _write(folder: Path, name: str, picture: Floats, moving: NDArray[np.bool_]) 
     masks = np.repeat(moving[..., None], 3, axis=2).astype(np.uint8) * 255
     write_picture(folder / "masks" / f"{name}.png", masks)
     return f"{name}.png"
+
+
+def _write_layout(
+    folder: Path, written: dict[str, list[str]], entries: list[dict[str, object]], camera: Camera
+) -> None:
+    """Write what tells of the pictures, all taken through the lens of ``camera``."""
+    lists = {f"{split}_filenames": names for split, names in written.items()}
+    lens = {"fl_x": camera.fx, "fl_y": camera.fy, "cx": camera.cx, "cy": camera.cy}
+    sizes = {"w": camera.width, "h": camera.height, "camera_model": "OPENCV"}
+    document = {**lens, **sizes, **lists, "frames": entries}
+    (folder / "transforms.json").write_text(json.dumps(document), encoding="utf-8")
+    described = {"gsdmsr": 1, "bound": float(SIZE.max())}
+    (folder / "scene.json").write_text(json.dumps(described), encoding="utf-8")
 
 
 def _entry(name: str, time: float, camera: Camera) -> dict[str, object]:

@@ -7,12 +7,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from moving_room import SEEN, THINGS, on_path, seen_points, write_capture
+from moving_room import SEEN, SIZE, THINGS, on_path, seen_points, write_capture, write_rig
 from walking_capture import Capture, pixel_errors
 
 from gsdmsr_cli.formats import read_scene
 from gsdmsr_cli.scene.camera import Camera
 from gsdmsr_cli.scene.native import cv2
+from gsdmsr_cli.training.starting.around import cameras_stand_around
 
 
 def pixels(camera: Camera, points: np.ndarray) -> np.ndarray:
@@ -65,3 +66,17 @@ def test_errors_are_as_large_as_asked_for(room: tuple[Path, Capture]) -> None:
     counts = {split: len(read_scene(folder).split(split)) for split in ("train", "val", "test")}
     assert counts == {"train": 14, "val": 2, "test": 4}
     assert json.loads((folder / "scene.json").read_text())["bound"] == 3.0
+
+
+@pytest.mark.parametrize("around", [False, True])
+def test_a_rig_sees_what_moves_from_within_the_room(tmp_path: Path, around: bool) -> None:
+    """One camera of the ring stands so near that both things are beside its picture."""
+    write_rig(tmp_path, 32, 2, around)
+    scene = read_scene(tmp_path)
+    assert len(scene.split("train")) == 32 and len(scene.split("test")) == 6
+    assert cameras_stand_around(scene) is around
+    assert len({view.camera.centre.tobytes() for view in scene.views}) == 19
+    assert all((abs(view.camera.centre) < SIZE).all() for view in scene.views)
+    masks = [cv2.imread(str(view.signals["moving"]))[..., 0] for view in scene.views]
+    shares = np.array([(moving == 255).mean() for moving in masks])
+    assert (shares > 0).sum() == len(scene.views) - 2 * around and shares.max() < 0.5

@@ -16,21 +16,18 @@ from torch import Tensor
 
 from gsdmsr_cli.gaussians.moment import Moment
 from gsdmsr_cli.gaussians.splats import Splats
-from gsdmsr_cli.ground.geometry import quat_to_rotmat
 from gsdmsr_cli.model.layer import Facts, Instant, Layer
-from gsdmsr_cli.model.motion._rigidity import rigidity
 from gsdmsr_cli.model.parameter import Parameter
-from gsdmsr_cli.ops.nearest import nearest_points
 from gsdmsr_cli.ops.series import add_series
 from gsdmsr_cli.options.strict import require, require_rates
 
-ROWS, NEIGHBOURS = 1024, 8
-"""Splats that rigidity is evaluated at in a step, and how many of each other they are held to."""
+ROWS = 1024
+"""Splats whose smoothness is evaluated in a step."""
 
 
 @dataclass(frozen=True)
 class Options:
-    """Settings of the residuals and their regularisers.
+    """Settings of the residuals and their regulariser.
 
     Attributes:
         degree: of the polynomials of positions, rotations and scales, 1 or more.
@@ -42,7 +39,6 @@ class Options:
         time_rate: that of a splat's own scale and centre of time.
         smoothness: weight of the mean squared way of a splat between one train time and the next,
             in units of the bound.
-        rigidity: weight of the deviation of neighbouring splats from rigid motion.
     """
 
     degree: int = 3
@@ -53,7 +49,6 @@ class Options:
     rate: tuple[float, float] = (2e-3, 4e-5)
     time_rate: tuple[float, float] = (1e-3, 1e-4)
     smoothness: float = 0.1
-    rigidity: float = 0.001
 
     def __post_init__(self) -> None:
         require(self, "degree", self.degree >= 1, "1 or more")
@@ -111,44 +106,20 @@ class DualDomain(Layer):
     def penalty(
         self, moment: Moment, instant: Instant, generator: torch.Generator
     ) -> Tensor | None:
-        """Return how far splats go within a frame, and how little neighbours move together.
-
-        After the paper's time smoothness and rigidity of neighbours; of splats drawn at random.
-        """
+        """Return how far splats go within a frame: the paper's time smoothness, of some of them."""
         o = self.options
-        rows = torch.randperm(len(moment), generator=generator)[:ROWS]
-        rows = rows.to(self.means.device)
-        value: Tensor | None = None
-        now = self._offsets(rows, instant.time)
-        if o.smoothness > 0:
-            after = self._offsets(rows, instant.time + 1 / max(self.facts.frames - 1, 1))
-            ways = (after - now)[:, :3]
-            value = o.smoothness * ways.square().sum(dim=1).mean()
-        if o.rigidity > 0 and len(rows) > NEIGHBOURS:
-            deviation = o.rigidity * self._deviation(moment.splats.take(rows), now)
-            value = deviation if value is None else value + deviation
-        return value
+        if not o.smoothness > 0:
+            return None
+        rows = torch.randperm(len(moment), generator=generator)[:ROWS].to(self.means.device)
+        later = instant.time + 1 / max(self.facts.frames - 1, 1)
+        way = self._offsets(rows, later) - self._offsets(rows, instant.time)
+        return o.smoothness * way.square().sum(dim=1).mean()
 
     def _offsets(self, rows: Tensor, time: float) -> Tensor:
-        """Return what is added to means [bounds] and quats of some splats, (M, 7)."""
+        """Return what is added to the means of some splats at a time, (M, 3) [bounds]."""
         o = self.options
         basis = time_basis(self._own_times(time)[rows], o.degree, o.harmonics, o.period)
-        nothing = [self.means.new_zeros(len(rows), width) for width in (3, 4)]
-        own = zip(nothing, (self.means, self.quats), strict=True)
-        return torch.cat([add_series(zero, c[rows], basis) for zero, c in own], dim=1)
-
-    def _deviation(self, splats: Splats, offsets: Tensor) -> Tensor:
-        """Return how far splats are from taking each other along as rigid bodies would."""
-        points, quats = splats.means.detach(), splats.quats.detach()
-        offset, turn = offsets.split([3, 4], dim=1)
-        offset = offset * self.facts.bound
-        rotation = quat_to_rotmat(quats + turn) @ quat_to_rotmat(quats).mT
-        matrix = rotation - torch.eye(3, device=points.device)
-        shift = offset - (matrix @ points[:, :, None])[:, :, 0]
-        unused = points.new_zeros(len(points), 7)
-        guesses = torch.zeros(len(points), NEIGHBOURS, dtype=torch.int32, device=points.device)
-        near = nearest_points(points, points, guesses)
-        return rigidity(points, torch.cat([matrix.flatten(1), shift, unused], dim=1), near)
+        return add_series(self.means.new_zeros(len(rows), 3), self.means[rows], basis)
 
 
 def time_basis(times: Tensor, degree: int, harmonics: int, period: float) -> Tensor:

@@ -19,6 +19,7 @@ from gsdmsr_cli.runs.run import open_with_model
 from gsdmsr_cli.scene.pictures import Pictures
 from gsdmsr_cli.scene.scene import Scene
 from gsdmsr_cli.training.starting import silhouettes, surfaces
+from gsdmsr_cli.training.starting.around import cameras_stand_around
 from gsdmsr_cli.training.starting.sightings import Points, at_unknown_times, colours_of
 
 NEIGHBOURS = 3
@@ -42,9 +43,9 @@ def initial_splats(
 
     They sit at the scene's own points, or at ``most`` of them chosen at random. Where there are
     none, or the start is "surfaces" and there are fewer than ``options.count``, others join them as
-    ``options.start`` says: at random in the box and nearly grey, as all methods do on D-NeRF; where
-    silhouettes overlap; or on surfaces. Those of the run ``options.of_run`` stand in place of all
-    these, as they are.
+    ``options.start`` and ``options.box_if`` say: at random in the box and nearly grey, as all
+    methods do on D-NeRF; where silhouettes overlap; or on surfaces. Those of the run
+    ``options.of_run`` stand in place of all these, as they are.
 
     Raises:
         DataError: that run cannot be used.
@@ -54,8 +55,9 @@ def initial_splats(
         return splats, torch.full((len(splats),), math.nan)
     given = _given_points(scene, pictures, most, generator)
     wanted = min(options.count, most) - len(given.means)
-    if not len(given.means) or (options.start == "surfaces" and wanted > 0):
-        more = _new_points(scene, options.start, wanted, pictures, background, generator)
+    start = _start(scene, options)
+    if not len(given.means) or (start == "surfaces" and wanted > 0):
+        more = _new_points(scene, start, wanted, pictures, background, generator)
         given = Points(*map(torch.cat, zip(given, more, strict=True)))
     means, colours, times = given
     n = len(means)
@@ -86,6 +88,12 @@ def of_run(folder: Path, sh_degree: int) -> Splats:
         splats.sh[:, :wanted], (0, 0, 0, max(0, wanted - splats.sh.shape[1]))
     )
     return replace(splats, sh=sh.contiguous())
+
+
+def _start(scene: Scene, options: SplatOptions) -> str:
+    """Return where splats lie that the scene brings no points for, see ``SplatOptions.start``."""
+    in_box = options.box_if == "around" and cameras_stand_around(scene)
+    return "box" if in_box else options.start
 
 
 def _given_points(

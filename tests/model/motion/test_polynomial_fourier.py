@@ -89,34 +89,8 @@ def test_smoothness_is_the_mean_squared_way_within_a_frame() -> None:
     assert found.item() == pytest.approx(3.0 * (2.0 / 19 / 1.3) ** 2, rel=1e-4)
 
 
-def turned(splats: Splats, motion: Layer, angle: float, follow: bool) -> Tensor:
-    """Return the rigidity of splats that go round the z axis by an angle at the end of time."""
-    x, y, _ = splats.means.unbind(dim=1)
-    c, s = math.cos(angle), math.sin(angle)
-    way = torch.stack([(c - 1) * x - s * y, s * x + (c - 1) * y, torch.zeros_like(x)], dim=1)
-    w, half = math.cos(angle / 2), math.sin(angle / 2)
-    with torch.no_grad():
-        motion.tensors()["means"][:, 0] = 2 * way / FACTS.bound
-        if follow:  # the rotation by the angle times the splat's own, which is the identity
-            motion.tensors()["quats"][:, 0] = 2 * torch.tensor([w - 1, 0.0, 0.0, half])
-    found = penalty_of(motion, splats, 1.0, generator())
-    assert found is not None
-    return found
-
-
-def test_rigidity_is_0_for_a_body_that_turns_and_not_for_splats_that_do_not_turn_with_it() -> None:
-    """Splats that move along arcs without turning deviate by |R - 1|^2 of the mean of pairs."""
-    splats = splats_of(60)
-    splats.quats[:] = torch.tensor([1.0, 0.0, 0.0, 0.0])
-    options = {"smoothness": 0.0, "rigidity": 2.0}
-    rigid = turned(splats, started(NAME, 60, **options), 0.5, follow=True)
-    loose = turned(splats, started(NAME, 60, **options), 0.5, follow=False)
-    assert rigid.item() == pytest.approx(0.0, abs=1e-9)
-    assert loose.item() > 0.1
-
-
-def test_without_weights_there_is_no_penalty() -> None:
-    motion = disturbed(started(NAME, 60, smoothness=0.0, rigidity=0.0))
+def test_without_its_weight_there_is_no_penalty() -> None:
+    motion = disturbed(started(NAME, 60, smoothness=0.0))
     assert penalty_of(motion, splats_of(60), 0.3, generator()) is None
 
 
