@@ -65,8 +65,8 @@ class SplatOptions:
             fewer than that.
         start: where they lie: "box" evenly in the scene's box, "silhouettes" where the silhouettes
             of the train views overlap, "surfaces" where neighbouring train views agree.
-        box_if: when they lie in the box in place of that: never, or if train cameras stand around
-            what they see, which ``training.starting.around`` decides.
+        start_around: the same where train cameras stand around what they see, which
+            ``training.starting.around`` decides; null makes no difference.
         of_run: folder of a run whose canonical splats are taken as they are in place of all that;
             null takes none.
         opacity: their opacity, between 0 and 1.
@@ -76,7 +76,7 @@ class SplatOptions:
 
     count: int = 2500
     start: Literal["box", "silhouettes", "surfaces"] = "silhouettes"
-    box_if: Literal["never", "around"] = "never"
+    start_around: Literal["box", "silhouettes", "surfaces"] | None = None
     of_run: str | None = None
     opacity: float = 0.1
     sh_degree: int = 1

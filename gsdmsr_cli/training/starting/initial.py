@@ -43,7 +43,7 @@ def initial_splats(
 
     They sit at the scene's own points, or at ``most`` of them chosen at random. Where there are
     none, or the start is "surfaces" and there are fewer than ``options.count``, others join them as
-    ``options.start`` and ``options.box_if`` say: at random in the box and nearly grey, as all
+    ``options.start`` and ``options.start_around`` say: at random in the box and nearly grey, as all
     methods do on D-NeRF; where silhouettes overlap; or on surfaces. Those of the run
     ``options.of_run`` stand in place of all these, as they are.
 
@@ -92,8 +92,9 @@ def of_run(folder: Path, sh_degree: int) -> Splats:
 
 def _start(scene: Scene, options: SplatOptions) -> str:
     """Return where splats lie that the scene brings no points for, see ``SplatOptions.start``."""
-    in_box = options.box_if == "around" and cameras_stand_around(scene)
-    return "box" if in_box else options.start
+    if options.start_around is not None and cameras_stand_around(scene):
+        return options.start_around
+    return options.start
 
 
 def _given_points(
