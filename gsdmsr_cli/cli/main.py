@@ -90,6 +90,12 @@ def _common(
 
 
 _INTERRUPTED = 130
+_AGAIN_S = 0.001
+"""After which a Ctrl-C comes again that came where no exception may be raised."""
+
+_NO_RAISING = "_numba_unpickle"
+"""Called by numba's C code as a kernel returns a tuple, which does not look for exceptions: a
+KeyboardInterrupt there becomes a SystemError, or a crash."""
 
 _KINDS = {1: "internal", 2: "usage", 3: "data", 4: "threshold", _INTERRUPTED: "interrupted"}
 """What the errors of each exit code are called in JSON."""
@@ -186,6 +192,11 @@ def _interrupt(_number: int, frame: FrameType | None) -> None:
     while frame is not None:
         if frame.f_globals.get("__name__") == "importlib._bootstrap":
             os._exit(130)  # nothing has been begun that would have to be cleared away
+        if frame.f_code.co_name == _NO_RAISING:
+            again = threading.Timer(_AGAIN_S, signal.raise_signal, [signal.SIGINT])
+            again.daemon = True
+            again.start()
+            return
         frame = frame.f_back
     raise KeyboardInterrupt
 

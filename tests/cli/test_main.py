@@ -9,8 +9,10 @@ import signal
 import subprocess
 import sys
 import time
+from types import FrameType
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 import typer
@@ -19,6 +21,7 @@ from gsdmsr_cli.cli.main import ctrl_c_that_spares_imports
 from gsdmsr_cli.ground.errors import DataError, GsdmsrError, ThresholdError, UsageError
 from gsdmsr_cli.ground.origin import version
 from gsdmsr_cli.ground.printing import is_printable, one_line
+from gsdmsr_cli.ops.rasterize.cpu.binning import bin_splats
 
 Gsdmsr = Any  # the fixture of conftest.py
 
@@ -259,3 +262,25 @@ def test_a_terminal_that_is_closed_is_ctrl_c_unless_nohup_is_asked_for(ignored: 
         assert ended is not ignored
     finally:
         signal.signal(signal.SIGHUP, before)
+
+
+def test_ctrl_c_while_a_kernel_returns_is_ctrl_c() -> None:
+    """Numba's C code calls Python to return a tuple; an exception there was lost, or a crash."""
+    ones = np.ones(1, np.float32)
+    arguments = (np.ones((1, 2), np.float32), np.ones((1, 3), np.float32), ones, ones)
+    signalled = 0
+
+    def signal_once(frame: FrameType, event: str, _argument: object) -> None:
+        nonlocal signalled
+        if event == "call" and frame.f_code.co_name == "_numba_unpickle" and not signalled:
+            signalled += 1
+            signal.raise_signal(signal.SIGINT)
+
+    with ctrl_c_that_spares_imports(), pytest.raises(KeyboardInterrupt):
+        sys.setprofile(signal_once)
+        try:
+            bin_splats(*arguments, np.ones(1, np.int32), 8, 8)
+            assert signalled
+            time.sleep(10)
+        finally:
+            sys.setprofile(None)
