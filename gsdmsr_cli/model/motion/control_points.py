@@ -78,10 +78,7 @@ class ControlPointMotion(ControlPoints):
         self._rigidity = options.rigidity
         times = time_nodes(facts.frames, options.time_ratio)
         self._place = sparser_at_ends(options.time_ends)
-        self.levels = [
-            planes.new_level(resolution, times, options.channels, generator)
-            for resolution in options.levels
-        ]
+        self.levels = planes.new_levels(options.levels, times, options.channels, generator)
         widths = [options.channels * len(options.levels), options.width, options.width, OUTPUTS]
         self.layers = network.new_network(widths, generator)
         self._parameters += (

@@ -56,10 +56,7 @@ class HexPlaneMotion(Layer):
     def __init__(self, options: Options, facts: Facts, generator: torch.Generator) -> None:
         self.options, self.facts = options, facts
         times = time_nodes(facts.frames, options.time_ratio)
-        self.levels = [
-            planes.new_level(resolution, times, options.channels, generator)
-            for resolution in options.levels
-        ]
+        self.levels = planes.new_levels(options.levels, times, options.channels, generator)
         features = options.channels * len(options.levels)
         separate = options.heads == "separate"
         second = options.width * (len(PARTS) if separate else 1)

@@ -20,6 +20,7 @@ from gsdmsr_cli.gaussians.moment import Moment
 from gsdmsr_cli.gaussians.splats import Splats
 from gsdmsr_cli.model.layer import Facts, Instant, Layer
 from gsdmsr_cli.model.limits import require_multiples
+from gsdmsr_cli.model.motion._decoder_smoothness import roughness, some_twice
 from gsdmsr_cli.model.motion._grids import split_times, time_nodes
 from gsdmsr_cli.model.motion._limits import require_levels, require_resolutions
 from gsdmsr_cli.model.parameter import Parameter, name_parameters
@@ -27,9 +28,6 @@ from gsdmsr_cli.ops import network, planes
 from gsdmsr_cli.ops.displace import OUTPUTS, displace
 
 _EMBEDDINGS = "embeddings"
-
-SMOOTH_ROWS = 1024
-"""Splats that L_smooth is evaluated at in a step."""
 
 
 @dataclass(frozen=True)
@@ -91,15 +89,12 @@ class MultiscaleMotion(Layer):
         self.options, self.facts = options, facts
         self.fine_active = False
         coarse_times = time_nodes(facts.frames, options.coarse_time_ratio)
-        self.coarse = [
-            planes.new_level(options.coarse_level, coarse_times, options.coarse_channels, generator)
-        ]
+        self.coarse = planes.new_levels(
+            [options.coarse_level], coarse_times, options.coarse_channels, generator
+        )
         self.coarse_decoder = network.new_network([options.coarse_channels, 3], generator)
         times = time_nodes(facts.frames, options.time_ratio)
-        self.fine = [
-            planes.new_level(resolution, times, options.channels, generator)
-            for resolution in options.levels
-        ]
+        self.fine = planes.new_levels(options.levels, times, options.channels, generator)
         features = options.channels * len(options.levels) + options.embedding
         features += options.coarse_channels if options.pyramid else 0
         widths = [features, options.width, options.width, OUTPUTS]
@@ -177,24 +172,15 @@ class MultiscaleMotion(Layer):
         if self.embeddings is not None and o.embedding_weight > 0 and self.fine_active:
             value = value + o.embedding_weight * self.embeddings.square().mean()
         if o.smooth_weight > 0 and self.fine_active:
-            value = value + o.smooth_weight * self._roughness(moment.splats, instant, generator)
+            reach = o.smooth_reach * self.facts.bound
+            some = some_twice(moment.splats, self.embeddings, reach, generator)
+            value = value + o.smooth_weight * roughness(self._fine_outputs(*some, instant))
         return value
 
-    def _roughness(self, splats: Splats, instant: Instant, generator: torch.Generator) -> Tensor:
-        """Return how much the decoder differs between points that are close to each other.
-
-        A finite difference in place of the method's |grad_x phi|^2, at some of the splats.
-        """
-        rows = torch.randint(len(splats), (SMOOTH_ROWS,), generator=generator)
-        rows = rows.to(splats.means.device)
-        places = splats.means.detach()[rows]
-        reach = self.options.smooth_reach * self.facts.bound
-        beside = places + reach * torch.randn(places.shape, generator=generator).to(places)
-        own = None if self.embeddings is None else self.embeddings[rows].repeat(2, 1)
-        both = replace(splats.take(rows.repeat(2)), means=torch.cat([places, beside]))
-        features = self._features(self.coarse + self.fine, both, [instant], own)
-        here, there = self._decode(features)[1].chunk(2)
-        return (here - there).square().sum(dim=1).mean()
+    def _fine_outputs(self, splats: Splats, embeddings: Tensor | None, instant: Instant) -> Tensor:
+        """Return what the fine decoder says of splats that have such features of their own."""
+        features = self._features(self.coarse + self.fine, splats, [instant], embeddings)
+        return self._decode(features)[1]
 
     def check(self) -> None:
         """Raise ValueError unless grids, decoders and features of their own fit together."""

@@ -27,6 +27,7 @@ from gsdmsr_cli.ops.planes.levels import (
     check_levels,
     features_of,
     new_level,
+    new_levels,
     to_cube,
 )
 from gsdmsr_cli.ops.planes.twin import lookup_twin, penalty_twin
@@ -43,6 +44,7 @@ __all__ = [
     "lookup_at_times",
     "lookup_twin",
     "new_level",
+    "new_levels",
     "penalty",
     "penalty_twin",
     "to_cube",

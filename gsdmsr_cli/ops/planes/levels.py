@@ -60,6 +60,13 @@ def new_level(resolution: int, times: int, channels: int, generator: torch.Gener
     return Level(space * 0.4 + 0.1, torch.ones(3, chunks, times, resolution, LANES))
 
 
+def new_levels(
+    resolutions: Sequence[int], times: int, channels: int, generator: torch.Generator
+) -> list[Level]:
+    """Return a new level of each resolution; see ``new_level``."""
+    return [new_level(resolution, times, channels, generator) for resolution in resolutions]
+
+
 def features_of(levels: Sequence[Level]) -> int:
     """Return how many features the levels give together."""
     return sum(level.channels for level in levels)

@@ -32,7 +32,7 @@ from gsdmsr_cli.ground import plugins
 from gsdmsr_cli.ground.errors import UsageError
 from gsdmsr_cli.model import motion as motions
 from gsdmsr_cli.model.layer import Facts, Instant, Layer, options_of
-from gsdmsr_cli.model.motion.multiscale import SMOOTH_ROWS
+from gsdmsr_cli.model.motion._decoder_smoothness import ROWS
 from gsdmsr_cli.ops import hash_grid
 from gsdmsr_cli.ops.hash_grid import lookup_twin as lookup_hashed_twin
 from gsdmsr_cli.ops.planes import CUBE, Level, lookup_twin, penalty_twin
@@ -402,7 +402,7 @@ def test_multiscale_smooths_the_decoder_over_a_reach_in_units_of_the_bound(
     motion = disturbed(started("multiscale", COUNT, **weights, **reach))
     found = penalty_of(motion, splats, time, generator(7))
     source, tensors = generator(7), motion.tensors()
-    rows = torch.randint(COUNT, (SMOOTH_ROWS,), generator=source)
+    rows = torch.randint(COUNT, (ROWS,), generator=source)
     places = splats.means[rows]
     far = reach.get("smooth_reach", 0.005) * FACTS.bound
     beside = places + far * torch.randn(places.shape, generator=source)
