@@ -19,7 +19,7 @@ PUBLISHED = ("alex", "vgg")
 _LPIPS = tuple(f"lpips_{net}" for net in NETS)
 _LPIPS_INRIA = tuple(f"lpips_{net}_inria" for net in PUBLISHED)
 
-WHOLE = ("psnr", "psnr_float", "ssim", "ms_ssim", *_LPIPS, *_LPIPS_INRIA)
+WHOLE = ("psnr", "psnr_float", "psnr_fitted", "ssim", "ms_ssim", *_LPIPS, *_LPIPS_INRIA)
 """Metrics of whole pictures."""
 
 FLICKER = ("flicker", "flicker_true", "flicker_excess")

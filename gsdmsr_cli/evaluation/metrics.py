@@ -60,6 +60,25 @@ def psnr(rendered: Tensor, target: Tensor, where: Tensor | None = None) -> float
     return -10.0 * math.log10(error) if error != 0.0 else math.inf
 
 
+@torch.no_grad()
+def psnr_fitted(rendered: Tensor, target: Tensor) -> float:
+    """Return the PSNR [dB] after the affine transform of colours A c + b that is best for it.
+
+    A is (3, 3), b is (3), both by least squares over all pixels; the result is clamped to [0, 1].
+    So it does not count what a camera's exposure and white balance alone make of a picture, which
+    is not known of one that nothing was trained on. See ``psnr`` for arguments, errors, and values
+    without a number.
+    """
+    _check_shapes(rendered, target)
+    colours = rendered.reshape(-1, 3).double()
+    if not (colours.isfinite().all() and target.isfinite().all()):
+        return math.nan
+    rows = torch.cat([colours, torch.ones_like(colours[:, :1])], dim=1)
+    products = rows.T @ target.reshape(-1, 3).double()
+    fitted = rows @ (torch.linalg.pinv(rows.T @ rows, hermitian=True) @ products)
+    return psnr(fitted.clamp(0.0, 1.0).reshape(rendered.shape), target)
+
+
 @torch.inference_mode()
 def ssim(rendered: Tensor, target: Tensor, where: Tensor | None = None) -> float:
     """Return the mean structural similarity over all pixels and channels, at most 1.

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from gsdmsr_cli.drawing.splatting import draw
 from gsdmsr_cli.evaluation.catalogue import Metric
-from gsdmsr_cli.evaluation.metrics import PSNR_CAP, Missing, psnr, quantize, ssim
+from gsdmsr_cli.evaluation.metrics import PSNR_CAP, Missing, psnr, psnr_fitted, quantize, ssim
 from gsdmsr_cli.model.joined import own_name
 from gsdmsr_cli.model.model import FURTHER, MOTION, STORED_AS, Model
 from gsdmsr_cli.raster import Engine
@@ -23,6 +23,7 @@ from gsdmsr_cli.scene.scene import MASK, MOVING, View
 CONVENTIONS = {
     "renders": "clamped to [0, 1] and rounded to 8 bits; psnr_float is of unrounded ones",
     "psnr": f"of the mean squared error over all pixels and channels, at most {PSNR_CAP:g} dB",
+    "psnr_fitted": "after the affine transform of the drawn colours that is best for the picture",
     "ssim": "11 x 11 Gaussian window of sigma 1.5 px, zero padding, mean over all pixels",
     "ms_ssim": "five scales with that window, only the last padded (mirrored), as in torchmetrics",
     "lpips": "v0.1, pictures mapped to [-1, 1]; those named _inria on [0, 1]",
@@ -129,6 +130,7 @@ def score(
     values: dict[str, float] = {
         "psnr": psnr(rounded, true),
         "psnr_float": psnr(drawn.clamp(0, 1), true),
+        "psnr_fitted": psnr_fitted(rounded, true),
         "ssim": ssim(rounded, true),
     }
     for name, metric in metrics.items():

@@ -13,7 +13,14 @@ from skimage.metrics import structural_similarity
 from torch import Tensor
 from torchmetrics.functional.image import multiscale_structural_similarity_index_measure
 
-from gsdmsr_cli.evaluation.metrics import MS_SSIM_SMALLEST, ms_ssim, psnr, quantize, ssim
+from gsdmsr_cli.evaluation.metrics import (
+    MS_SSIM_SMALLEST,
+    ms_ssim,
+    psnr,
+    psnr_fitted,
+    quantize,
+    ssim,
+)
 from gsdmsr_cli.ground import ssim as ssim_constants
 from gsdmsr_cli.ops.photometric import cpu as photometric
 
@@ -60,6 +67,33 @@ def test_psnr_of_identical_pictures_is_infinite_and_of_nan_is_nan() -> None:
     assert psnr(x, x) == math.inf
     y[0, 0, 0] = math.nan
     assert math.isnan(psnr(x, y))
+
+
+def test_psnr_fitted_takes_exposure_and_white_balance_away() -> None:
+    true = 0.2 + 0.6 * pair(16, 12)[0]
+    mixing = torch.tensor([[0.7, 0.1, 0.0], [0.0, 0.8, 0.1], [0.1, 0.0, 0.6]])
+    drawn = true @ mixing.T + 0.05
+    assert psnr(drawn, true) < 25 and psnr_fitted(drawn, true) > 100
+
+
+def test_psnr_fitted_is_of_the_least_squares() -> None:
+    """What numpy's solver of least squares leaves, pixel by pixel."""
+    drawn, true = (0.3 + 0.4 * picture for picture in pair(16, 12))
+    rows = np.c_[drawn.reshape(-1, 3).double().numpy(), np.ones(16 * 12)]
+    wanted = true.reshape(-1, 3).double().numpy()
+    left = rows @ np.linalg.lstsq(rows, wanted, rcond=None)[0] - wanted
+    expected = -10 * math.log10(float((left**2).mean()))
+    assert psnr_fitted(drawn, true) == pytest.approx(expected, abs=1e-6)
+    assert psnr_fitted(drawn, true) >= psnr(drawn, true)
+
+
+def test_psnr_fitted_of_one_colour_and_of_nan() -> None:
+    """One colour is fitted by the mean of the true picture."""
+    true = pair(16, 12)[0]
+    spread = float((true.double() - true.double().mean(dim=(0, 1))).square().mean())
+    found = psnr_fitted(torch.full_like(true, 0.9), true)
+    assert found == pytest.approx(-10 * math.log10(spread), abs=1e-6)
+    assert math.isnan(psnr_fitted(torch.full_like(true, math.nan), true))
 
 
 @pytest.mark.parametrize(("height", "width"), [(1, 1), (3, 14), (12, 11), (17, 20)])

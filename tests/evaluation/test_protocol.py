@@ -40,7 +40,9 @@ def grey(level: float) -> Tensor:
 def test_scores_of_the_true_picture_itself() -> None:
     picture = torch.from_numpy(noise(12, 14, 3).astype(np.float32)) / 255
     scores = score(picture, picture, {})
-    assert scores == {"psnr": 100.0, "psnr_float": 100.0, "ssim": pytest.approx(1.0)}
+    assert scores == {
+        "psnr": 100.0, "psnr_float": 100.0, "psnr_fitted": 100.0, "ssim": pytest.approx(1.0),
+    }  # fmt: skip
 
 
 def test_psnr_is_of_rounded_pictures_and_psnr_float_is_not() -> None:
@@ -67,7 +69,9 @@ def test_drawn_values_outside_are_clamped() -> None:
 def test_a_picture_with_nan_has_no_scores() -> None:
     drawn = grey(0.5)
     drawn[3, 4, 1] = math.nan
-    assert score(drawn, grey(0.5), {}) == {"psnr": None, "psnr_float": None, "ssim": None}
+    assert score(drawn, grey(0.5), {}) == dict.fromkeys(
+        ("psnr", "psnr_float", "psnr_fitted", "ssim")
+    )
 
 
 def test_lpips_is_of_the_rounded_picture_and_none_where_missing() -> None:
@@ -103,7 +107,8 @@ def test_parts_of_a_picture_are_scored_and_empty_ones_left_out() -> None:
     left[:, :5] = True
     scores = score(drawn, true, {}, {"moving": left, "static": ~left, "masked": left & ~left})
     assert scores.keys() == {
-        "psnr", "psnr_float", "ssim", "psnr_moving", "ssim_moving", "psnr_static", "ssim_static",
+        "psnr", "psnr_float", "psnr_fitted", "ssim",
+        "psnr_moving", "ssim_moving", "psnr_static", "ssim_static",
     }  # fmt: skip
     rounded = quantize(drawn)
     assert scores["psnr_moving"] == pytest.approx(psnr(rounded[:, :5], true[:, :5]), abs=1e-9)
