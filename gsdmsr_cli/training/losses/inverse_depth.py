@@ -1,0 +1,73 @@
+"""What is drawn lies as far away as the pictures allow.
+
+Depths of what has no texture, and of what few cameras see, are open: splats anywhere before a plain
+wall look right in the train views, and are fog in front of a camera that stands elsewhere. Kin to
+the occlusion regularisation of FreeNeRF (Yang, Pavone, Wang, CVPR 2023, section 3.4), which holds
+down density near the cameras, but without a distance that is near.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from gsdmsr_cli.options.strict import require, require_progress
+from gsdmsr_cli.scene.scene import MASK
+from gsdmsr_cli.training.losses import Seen, Term
+
+LEAST_COVER = 0.05
+"""Pixels count where the splats cover this much or more: elsewhere there is no depth."""
+
+_NEAREST = 1e-6
+"""Depth below which the inverse is taken of this [world units], so that it is finite."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """Settings.
+
+    Attributes:
+        factor: weight of the term.
+        until: progress up to which it counts.
+    """
+
+    factor: float = 0.03
+    until: float = 1.0
+
+    def __post_init__(self) -> None:
+        require(self, "factor", self.factor > 0, "a number above 0")
+        require_progress(self, "until")
+
+
+class InverseDepth(Term):
+    """The logarithm of the mean inverse depth, whose gradient has no unit of length."""
+
+    needs_depth: ClassVar[bool] = True
+
+    def __init__(self, options: Options) -> None:
+        self.options = options
+
+    def weight(self, progress: float) -> float:
+        """Return the factor until the term ends, then 0."""
+        return self.options.factor if progress < self.options.until else 0.0
+
+    def __call__(self, seen: Seen) -> Tensor:
+        """Return log of the mean of alpha / (blended depth) over the pixels that count, ()."""
+        alpha, depth = seen.frame.alpha, seen.frame.depth
+        assert depth is not None
+        counts = alpha.detach() >= LEAST_COVER
+        mask = seen.pictures.signal(seen.view, MASK)
+        if mask is not None:
+            counts &= mask.to(counts.device)
+        inverse = torch.where(counts, alpha / depth.clamp(min=_NEAREST), 0.0)
+        covered = counts.sum()
+        mean = inverse.sum() / covered.clamp(min=1)
+        return torch.where(covered > 0, mean.clamp(min=_NEAREST).log(), 0.0)
+
+
+def start(options: Options) -> InverseDepth:
+    """Return the term."""
+    return InverseDepth(options)
