@@ -135,6 +135,11 @@ class Trainer:
         """What is trained."""
         return self.population.model
 
+    @property
+    def frozen(self) -> bool:
+        """Whether the canonical splats stay as they are, and the motion alone is learnt."""
+        return False
+
     def _beginning(self) -> Scene:
         """Return the scene in whose views the initial splats are looked for."""
         return self.scene
@@ -162,7 +167,7 @@ class Trainer:
             self._enter_phase(progress)
         gated = self._is_gated(progress)
         mask = self.saliency.gradient_mask(self.clock.step) if gated else None
-        phase = Phase(progress, self.population.moving, mask)
+        phase = Phase(progress, self.population.moving, mask, self.frozen)
         with self._choices_that_count():
             orders = self._choose_views(progress)
             with self.stopwatch.of("gradients"):

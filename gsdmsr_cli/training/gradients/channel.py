@@ -70,7 +70,7 @@ class _Task:
 
     Attributes:
         sizes: how large the model is, if that is new, else None.
-        gradient_mask, progress, moving: see ``Phase``.
+        gradient_mask, progress, moving, frozen: see ``Phase``.
         orders: see ``Order``, tile weights as arrays.
     """
 
@@ -78,6 +78,7 @@ class _Task:
     gradient_mask: NDArray[Any] | None
     progress: float
     moving: bool
+    frozen: bool
     orders: Sequence[Order]
 
 
@@ -143,7 +144,7 @@ class ForkedChannel:
         news = None if sizes == self._sizes else sizes
         self._sizes = sizes
         task = _Task(
-            news, _sent(phase.gradient_mask), phase.progress, phase.moving,
+            news, _sent(phase.gradient_mask), phase.progress, phase.moving, phase.frozen,
             [order._replace(tile_weights=_sent(order.tile_weights)) for order in orders],
         )  # fmt: skip
         try:
@@ -216,7 +217,8 @@ class _Worker:
             model.become(task.sizes.splats, task.sizes.moving)
             self._published.attach(model, task.sizes.shapes)
         model.advance(task.progress)
-        phase = Phase(task.progress, task.moving, _received(task.gradient_mask))
+        mask = _received(task.gradient_mask)
+        phase = Phase(task.progress, task.moving, mask, task.frozen)
         answers = []
         for sent, buffers in zip(task.orders, self._answers, strict=False):
             order = sent._replace(tile_weights=_received(sent.tile_weights))

@@ -16,11 +16,13 @@ class Phase(NamedTuple):
         progress: in [0, 1].
         moving: whether the splats move yet.
         gradient_mask: (N,) bool, the splats whose gradients reach layers, see ``Model.at``.
+        frozen: whether the canonical splats stay as they are, as after a stream's first moment.
     """
 
     progress: float
     moving: bool
     gradient_mask: Tensor | None = None
+    frozen: bool = False
 
 
 class Order(NamedTuple):

@@ -71,7 +71,7 @@ class TrainingRenderer:
         Raises:
             DataError: a view's picture cannot be read.
         """
-        if any(term.weight(phase.progress) > 0 for term in self.terms) or model.shades:
+        if any(weight > 0 for weight in self._weights(phase)) or model.shades:
             return [self._with_terms(model, order, phase) for order in orders]
         pictures, views = self._pictures(phase.progress), [self.views[o.row] for o in orders]
         seen = [
@@ -105,7 +105,7 @@ class TrainingRenderer:
         pictures, view = self._pictures(phase.progress), self.views[order.row]
         recorded, target = pictures.camera(view), self._resident.load(pictures, view)
         instant, camera = model.instant_of_view(view.time, recorded, order.jitter)
-        weights = [term.weight(phase.progress) for term in self.terms]
+        weights = self._weights(phase)
         times = order.other_times or [None] * len(self.terms)
         others = [
             None if time is None or not weight > 0 else model.instant(time, camera, order.jitter)
@@ -118,7 +118,7 @@ class TrainingRenderer:
             self.engine, model, traced, instant, camera, self.background, target,
             self._ssim_weight(phase.progress), self._sh_degree(phase.progress),
             self._on_device(order.tile_weights), pictures.signal(view, MASK),
-            self.preset.losses.inliers, any(term.needs_depth for term in self.terms),
+            self.preset.losses.inliers, self._need_depth(weights),
         )  # fmt: skip
         loss = judged.loss
         for term, weight, other in zip(self.terms, weights, others, strict=True):
@@ -133,6 +133,19 @@ class TrainingRenderer:
         gradients, on_screen = differentiate(loss, judged, frame, model)
         size = camera.width, camera.height
         return ViewGradients(loss.detach(), gradients, on_screen, size, judged.errors)
+
+    def _weights(self, phase: Phase) -> list[float]:
+        """Return the factor of each term."""
+        return [
+            0.0 if phase.frozen and term.of_canonical else term.weight(phase.progress)
+            for term in self.terms
+        ]
+
+    def _need_depth(self, weights: Sequence[float]) -> bool:
+        return any(
+            term.needs_depth and weight > 0
+            for term, weight in zip(self.terms, weights, strict=True)
+        )
 
     def other_times(
         self, view: View, times: Sequence[float], generator: torch.Generator

@@ -73,10 +73,13 @@ class Term(ABC):
     Attributes:
         needs_depth: whether the frame is to have a depth.
         needs_seed: whether it makes random choices, which follow from ``Seen.seed``.
+        of_canonical: whether it is about where the canonical splats are, and has no part once they
+            stay as they are, as after the first moment of a stream.
     """
 
     needs_depth: ClassVar[bool] = False
     needs_seed: ClassVar[bool] = False
+    of_canonical: ClassVar[bool] = False
 
     def weight(self, progress: float) -> float:
         """Return the factor of the term at ``progress`` in [0, 1]; with 0 it costs nothing."""

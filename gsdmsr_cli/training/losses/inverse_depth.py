@@ -46,6 +46,7 @@ class InverseDepth(Term):
     """The logarithm of the mean inverse depth, whose gradient has no unit of length."""
 
     needs_depth: ClassVar[bool] = True
+    of_canonical: ClassVar[bool] = True
 
     def __init__(self, options: Options) -> None:
         self.options = options

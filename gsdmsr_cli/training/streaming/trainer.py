@@ -73,6 +73,11 @@ class StreamTrainer(Trainer):
         return cast(Streamed, self.model.layers[MOTION])
 
     @property
+    def frozen(self) -> bool:
+        """Whether the canonical splats stay as they are, as at all moments but the first."""
+        return self.clock.moment > 0
+
+    @property
     def learnt(self) -> frozenset[str]:
         """The names of what a moment after the first learns."""
         return frozenset(f"{MOTION}.{name}" for name in self.motion.learnt)
@@ -130,7 +135,7 @@ class StreamTrainer(Trainer):
 
     def _penalty(self, order: Order, progress: float) -> Penalty | None:
         """Return how far neighbours are from moving together, and its gradients."""
-        if not (self.clock.moment and self._stiffness) or self.clock.step % PENALTY_EVERY:
+        if not (self.frozen and self._stiffness) or self.clock.step % PENALTY_EVERY:
             return None
         value = self._stiffness(self._compared(), self.generator)
         return None if value is None else (value.detach(), gradients_of(value, self.model))

@@ -32,7 +32,7 @@ class Echo:
         on_screen = torch.zeros(count, 2)
         on_screen[:, 0] = torch.ones(count) if mask is None else mask
         on_screen[0, 1] = model.moving
-        told = [order.row, order.jitter, phase.progress, float(phase.moving)]
+        told = [order.row, order.jitter, phase.progress, float(phase.moving), float(phase.frozen)]
         told += [-1.0 if time is None else time for time in order.other_times]
         gradients = [None if "quats" in name else t.detach() for name, t in model.trained().items()]
         tiles = None if order.tile_weights is None else 2 * order.tile_weights
@@ -86,16 +86,16 @@ def assert_echoed(found: ViewGradients, model: Model) -> None:
 def test_an_order_and_its_phase_arrive_as_they_are_sent(connection: Connection) -> None:
     mask = torch.arange(COUNT) % 2 == 0
     orders = [Order(7, None, -1.5, (None, 0.25)), Order(3, torch.tensor([0.0, 3.0, 0.5]))]
-    first, second = connection.ask(orders, Phase(0.75, True, mask))
+    first, second = connection.ask(orders, Phase(0.75, True, mask, frozen=True))
     assert first.loss == 0.25 and first.size == (4, 5)
     assert first.tile_errors is not None and second.tile_errors is not None
-    assert first.tile_errors.tolist() == [7.0, -1.5, 0.75, 1.0, -1.0, 0.25]
+    assert first.tile_errors.tolist() == [7.0, -1.5, 0.75, 1.0, 1.0, -1.0, 0.25]
     assert second.tile_errors.tolist() == [0.0, 6.0, 1.0]
     assert torch.equal(first.on_screen[:, 0], mask.float())
     assert_echoed(first, connection.model)
     (found,) = connection.ask([Order(1)], Phase(0.0, False))
     assert found.on_screen[:, 0].all() and found.tile_errors is not None
-    assert found.tile_errors.tolist() == [1.0, 0.0, 0.0, 0.0]
+    assert found.tile_errors.tolist() == [1.0, 0.0, 0.0, 0.0, 0.0]
 
 
 def test_a_worker_follows_every_resize(connection: Connection) -> None:

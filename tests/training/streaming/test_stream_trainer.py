@@ -13,6 +13,8 @@ from training_checks import assert_same_tensors, copies, run_of
 
 from gsdmsr_cli.backends.cpu import jit
 from gsdmsr_cli.training.gradients.phase import Order
+from gsdmsr_cli.training.losses import Seen
+from gsdmsr_cli.training.losses.inverse_depth import InverseDepth
 from gsdmsr_cli.training.streaming import trainer as module
 from gsdmsr_cli.training.streaming.trainer import StreamTrainer
 
@@ -49,6 +51,23 @@ def test_each_moment_sees_its_own_pictures_and_all_of_them_before_any_again(
         assert {time for time, _ in own} == {shot.time}
         assert len(shot.rows) == 6 == len({name for _, name in own[:6]})
     assert not seen
+
+
+def test_terms_of_canonical_splats_count_at_the_first_moment_alone(
+    rig: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[float] = []
+
+    def value(self: InverseDepth, seen: Seen) -> torch.Tensor:
+        asked.append(seen.instant.time)
+        assert seen.frame.depth is not None
+        return seen.frame.depth.mean()
+
+    monkeypatch.setattr(InverseDepth, "__call__", value)
+    trainer = stream_trainer(rig, "losses.terms=[{name: inverse_depth}]")
+    assert not trainer.frozen
+    through(trainer, 2)
+    assert trainer.frozen and asked == [trainer.shots[0].time] * 2 * FIRST
 
 
 @every_way
