@@ -167,7 +167,8 @@ class Trainer:
             self._enter_phase(progress)
         gated = self._is_gated(progress)
         mask = self.saliency.gradient_mask(self.clock.step) if gated else None
-        phase = Phase(progress, self.population.moving, mask, self.frozen)
+        screens = gated or progress < self.preset.density.until
+        phase = Phase(progress, self.population.moving, mask, self.frozen, screens)
         with self._choices_that_count():
             orders = self._choose_views(progress)
             with self.stopwatch.of("gradients"):
@@ -175,8 +176,7 @@ class Trainer:
                     self.model, self.ranks.share(orders), phase,
                     lambda: self._penalty(orders[0], progress),
                 )  # fmt: skip
-                with_screens = gated or progress < self.preset.density.until
-                views = self.ranks.gather(self.model, orders, own, with_screens)
+                views = self.ranks.gather(self.model, orders, own, screens)
         loss = _set_gradients(self.model, views, penalty)
         self.clock.step += 1
         loss = self._checked(loss)

@@ -30,6 +30,8 @@ def main() -> None:
     asked.add_argument("--preset", default="n3v")
     asked.add_argument("--steps", type=int, default=600)
     asked.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
+    asked.add_argument("--starts", choices=STARTS, nargs="+", default=STARTS)
+    asked.add_argument("--set", dest="options", metavar="KEY=VALUE", action="append", default=[])
     args = asked.parse_args()
     print("| cameras | `splats.start` | train PSNR | test SSIM | test PSNR (each seed) |")
     print("|---|---|---:|---:|---:|")
@@ -37,8 +39,8 @@ def main() -> None:
         data = args.out / name
         if not (data / "transforms.json").is_file():
             write_rig(data, 160, 10, name == "ring")
-        for start in STARTS:
-            options = [f"splats.start={start}", "splats.start_around=null"]
+        for start in args.starts:
+            options = [f"splats.start={start}", "splats.start_around=null", *args.options]
             lines = []
             for seed in args.seeds:
                 trainer = trained(data, args.preset, 0.0, args.steps, seed, options)

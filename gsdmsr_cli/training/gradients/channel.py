@@ -70,15 +70,12 @@ class _Task:
 
     Attributes:
         sizes: how large the model is, if that is new, else None.
-        gradient_mask, progress, moving, frozen: see ``Phase``.
+        phase: its mask as an array.
         orders: see ``Order``, tile weights as arrays.
     """
 
     sizes: _Sizes | None
-    gradient_mask: NDArray[Any] | None
-    progress: float
-    moving: bool
-    frozen: bool
+    phase: Phase
     orders: Sequence[Order]
 
 
@@ -144,7 +141,7 @@ class ForkedChannel:
         news = None if sizes == self._sizes else sizes
         self._sizes = sizes
         task = _Task(
-            news, _sent(phase.gradient_mask), phase.progress, phase.moving, phase.frozen,
+            news, phase._replace(gradient_mask=_sent(phase.gradient_mask)),
             [order._replace(tile_weights=_sent(order.tile_weights)) for order in orders],
         )  # fmt: skip
         try:
@@ -216,9 +213,8 @@ class _Worker:
         if task.sizes is not None:
             model.become(task.sizes.splats, task.sizes.moving)
             self._published.attach(model, task.sizes.shapes)
-        model.advance(task.progress)
-        mask = _received(task.gradient_mask)
-        phase = Phase(task.progress, task.moving, mask, task.frozen)
+        model.advance(task.phase.progress)
+        phase = task.phase._replace(gradient_mask=_received(task.phase.gradient_mask))
         answers = []
         for sent, buffers in zip(task.orders, self._answers, strict=False):
             order = sent._replace(tile_weights=_received(sent.tile_weights))

@@ -36,6 +36,7 @@ def compare(
     tile_weights: Tensor | None = None,
     counted: Tensor | None = None,
     normal: float = 1.0,
+    screens: bool = True,
 ) -> ViewGradients:
     """Draw what a model is at a moment and compare the picture with a target.
 
@@ -49,6 +50,7 @@ def compare(
             everywhere; only where SSIM has no weight.
         counted: (H, W) bool, pixels that have a part in the loss, or None for all.
         normal: share of the pixels whose errors are taken to be normal, see ``inliers``.
+        screens: whether the gradients on the screen are wanted.
     """
     given = moment, camera, background, target, ssim_weight, sh_degree, tile_weights
     whole = counted is None and normal == 1
@@ -59,7 +61,7 @@ def compare(
         return ViewGradients(found.loss.detach(), gradients, found.on_screen, size, found.errors)
     frame = engine.rasterize(moment, camera, background, sh_degree)
     judged = judge(frame, target, ssim_weight, tile_weights, counted, normal)
-    gradients, on_screen = differentiate(judged.loss, judged, frame, model)
+    gradients, on_screen = differentiate(judged.loss, judged, frame, model, screens)
     return ViewGradients(judged.loss.detach(), gradients, on_screen, size, judged.errors)
 
 
@@ -129,7 +131,7 @@ class Judged(NamedTuple):
 
 
 def differentiate(
-    loss: Tensor, judged: Judged, frame: Frame, model: Model
+    loss: Tensor, judged: Judged, frame: Frame, model: Model, screens: bool = True
 ) -> tuple[Sequence[Tensor | None], Tensor]:
     """Return the gradients of a loss by all trained tensors, and of the unweighted by the screen.
 
@@ -138,14 +140,17 @@ def differentiate(
         judged: of the frame alone.
         frame: what was judged.
         model: whose it is.
+        screens: whether the gradients on the screen are wanted.
 
     Returns:
-        the gradients, and (N, 2) those by the positions on the screen [1 / px].
+        the gradients, and (N, 2) those by the positions on the screen [1 / px], or 0.
     """
     if loss is judged.unweighted:  # going back through the picture is what takes long: once will do
         wanted = [*model.trained().values(), frame.means2d]
         *gradients, on_screen = torch.autograd.grad(loss, wanted, allow_unused=True)
         return gradients, on_screen
+    if not screens:
+        return gradients_of(loss, model), torch.zeros_like(frame.means2d)
     (on_screen,) = torch.autograd.grad(judged.unweighted, frame.means2d, retain_graph=True)
     return gradients_of(loss, model), on_screen
 

@@ -17,12 +17,14 @@ class Phase(NamedTuple):
         moving: whether the splats move yet.
         gradient_mask: (N,) bool, the splats whose gradients reach layers, see ``Model.at``.
         frozen: whether the canonical splats stay as they are, as after a stream's first moment.
+        screens: whether anybody asks for the gradients on the screen.
     """
 
     progress: float
     moving: bool
     gradient_mask: Tensor | None = None
     frozen: bool = False
+    screens: bool = True
 
 
 class Order(NamedTuple):
@@ -51,7 +53,8 @@ class ViewGradients:
         loss: () of the view, outside the graph.
         gradients: of the loss by every trained tensor of the model, None where it has no part. Of
             views that were rendered together the first has the sum, the others have none.
-        on_screen: (N, 2) gradient of the photometric loss by the positions on the screen [1 / px].
+        on_screen: (N, 2) gradient of the photometric loss by the positions on the screen [1 / px];
+            may be 0 where nobody asks for it.
         size: width and height of the picture [px].
         tile_errors: of each tile, see ``raster.Comparison``.
     """

@@ -92,9 +92,9 @@ class TrainingRenderer:
             if all(moment.features is None for moment in at_once):
                 given = self.engine, model, at_once, cameras, self.background, targets
                 return compare_views(*given, *further, weights)
-        drawn = self.engine, model
+        drawn, rest = (self.engine, model), (normal, phase.screens)
         return [
-            compare(*drawn, moment, camera, self.background, target, *further, own, mask, normal)
+            compare(*drawn, moment, camera, self.background, target, *further, own, mask, *rest)
             for moment, camera, target, own, mask in zip(
                 moments, cameras, targets, weights, masks, strict=True
             )
@@ -130,7 +130,7 @@ class TrainingRenderer:
                     model.placed,
                 )  # fmt: skip
                 loss = loss + weight * term(seen)
-        gradients, on_screen = differentiate(loss, judged, frame, model)
+        gradients, on_screen = differentiate(loss, judged, frame, model, phase.screens)
         size = camera.width, camera.height
         return ViewGradients(loss.detach(), gradients, on_screen, size, judged.errors)
 

@@ -4,19 +4,22 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from datasets import noise, write_picture
-from training_checks import preset_of, trainer_of
+from training_checks import STEPS, preset_of, trainer_of
 
 from gsdmsr_cli.gaussians.moment import Moment
+from gsdmsr_cli.model.model import Model
 from gsdmsr_cli.raster import best_engine
 from gsdmsr_cli.scene.camera import Camera
 from gsdmsr_cli.scene.pictures import HalvedPictures, Pictures
 from gsdmsr_cli.scene.scene import MASK, View
 from gsdmsr_cli.training.gradients.phase import Order, Phase
+from gsdmsr_cli.training.gradients.renderer import TrainingRenderer
 from gsdmsr_cli.training.trainer import Trainer
 
 BACKGROUND = torch.tensor([1.0, 1.0, 1.0])
@@ -63,3 +66,50 @@ def test_half_the_size_counts_where_half_of_the_pixels_do(tmp_path: Path) -> Non
     assert counted is not None
     assert counted.tolist() == [[False, False, False], [True, False, True]]
     assert pictures.signal(replace(view, signals={}), MASK) is None
+
+
+def test_gradients_are_the_same_where_nobody_asks_for_those_on_the_screen(
+    tiny_scene: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With a term, what is on the screen takes going back through the picture once more."""
+    times: list[int] = []
+    grad = torch.autograd.grad
+
+    def counted(*given: Any, **options: Any) -> Any:
+        times.append(1)
+        return grad(*given, **options)
+
+    monkeypatch.setattr(torch.autograd, "grad", counted)
+    term = "losses.terms=[{name: inverse_depth}]"
+    trainer = trainer_of(tiny_scene, preset_of(term, "density.until=0.5"))
+    found = []
+    for screens in (True, False):
+        times.clear()
+        phase = Phase(0.9, moving=False, screens=screens)
+        found += trainer.renderer.gradients(trainer.model, [Order(0)], phase)
+        assert len(times) == 1 + screens
+    for with_screens, without in zip(*(one.gradients for one in found), strict=True):
+        assert (with_screens is None) is (without is None)
+        assert with_screens is None or torch.equal(with_screens, without)
+    assert found[0].on_screen.any() and not found[1].on_screen.any()
+
+
+def test_those_on_the_screen_are_asked_for_while_splats_grow_or_are_gated(
+    tiny_scene: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[tuple[float, bool]] = []
+    gradients = TrainingRenderer.gradients
+
+    def remember(self: TrainingRenderer, model: Model, orders: list[Order], phase: Phase) -> Any:
+        asked.append((phase.progress, phase.screens))
+        return gradients(self, model, orders, phase)
+
+    monkeypatch.setattr(TrainingRenderer, "gradients", remember)
+    for gate, since in (("none", 1.0), ("scale", 0.7)):
+        asked.clear()
+        options = ("density.until=0.4", f"saliency.gate={gate}", "saliency.gate_from=0.7")
+        trainer = trainer_of(tiny_scene, preset_of(*options))
+        for _ in range(STEPS):
+            trainer.step()
+        assert asked[-1][0] > 0.7
+        assert asked == [(progress, progress < 0.4 or progress >= since) for progress, _ in asked]
