@@ -25,6 +25,7 @@ def sample_points(
     A point inside a still solid lies in every silhouette, one on a limb that moves in some, one in
     empty space in few. The colour is the mean of the pixels that it falls on inside silhouettes.
     Pictures without a plain background are silhouette all over: then points fill the box evenly.
+    Where no view looks points are as dense as in the mean of where some do, for other cameras may.
 
     Args:
         scene: gives views and box.
@@ -42,7 +43,10 @@ def sample_points(
         seen += visible
         inside += hit
         colours += outline.pixels[row, column] / 255 * hit[:, None]
-    share = (inside / seen.clamp(min=1)).clamp(min=1e-3)
+    share = inside / seen.clamp(min=1)
+    if not (known := seen > 0).all():  # of what no view sees, the pictures say nothing
+        share[~known] = share[known].mean() if known.any() else 0.0
+    share = share.clamp(min=1e-3)
     rows = torch.multinomial(share.pow(SHARPNESS), count, replacement=True, generator=generator)
     # a small thing holds fewer candidates than points, so the points spread around them
     spacing = 2 * scene.bound / len(candidates) ** (1 / 3)

@@ -108,6 +108,29 @@ def test_pictures_without_silhouettes_fill_the_box_evenly(shade: int) -> None:
     torch.testing.assert_close(points.colours, torch.full((4000, 3), colour))
 
 
+@pytest.mark.parametrize("shade", [0, 255])
+def test_where_no_view_looks_points_are_as_dense_as_elsewhere(shade: int) -> None:
+    """Two cameras that see a part of the box each; what neither sees is grey."""
+    shots = [replace(shot, fx=60.0, fy=60.0) for shot in cameras(2, 16)]
+    pictures = [torch.full((3, 16, 16), shade, dtype=torch.uint8)] * 2
+    points = points_of(shots, pictures, count=4000)
+
+    def seen(means: Tensor) -> Tensor:
+        within = torch.zeros(len(means), dtype=torch.bool)
+        for shot in shots:
+            at = means.double() @ torch.tensor(shot.rotation).T + torch.tensor(shot.translation)
+            places = at[:, :2] / at[:, 2:] * 60 + 8
+            within |= ((places > 0) & (places < 16)).all(dim=1)
+        return within
+
+    anywhere = (2 * torch.rand(40000, 3, generator=generator(1)) - 1) * BOUND
+    expected = float(seen(anywhere).float().mean())
+    assert 0.05 < expected < 0.5
+    assert float(seen(points.means).float().mean()) == pytest.approx(expected, abs=0.03)
+    grey = (points.colours == 0.5).all(dim=1)
+    assert float(grey.float().mean()) == pytest.approx(1 - expected * (shade == 0), abs=0.03)
+
+
 def test_the_seed_decides() -> None:
     shots = cameras(4, 16)
     pictures = [photograph(shot, [ORANGE], WHITE) for shot in shots]
