@@ -12,7 +12,7 @@ from torch import Tensor
 from gsdmsr_cli.gaussians.moment import Moment
 from gsdmsr_cli.ground.splatting_constants import tile_grid
 from gsdmsr_cli.model.layer import Instant
-from gsdmsr_cli.model.model import Model
+from gsdmsr_cli.model.model import STORED_AS, Model
 from gsdmsr_cli.options.preset import BACKGROUNDS, Preset
 from gsdmsr_cli.raster import ComparingViews, Engine
 from gsdmsr_cli.scene.camera import Camera
@@ -120,7 +120,7 @@ class TrainingRenderer:
             self._on_device(order.tile_weights), pictures.signal(view, MASK),
             self.preset.losses.inliers, self._need_depth(weights),
         )  # fmt: skip
-        loss = judged.loss
+        loss, apart = judged.loss, judged.loss.new_zeros(())
         for term, weight, other in zip(self.terms, weights, others, strict=True):
             if weight > 0:
                 then = None if other is None else moments[other]
@@ -129,8 +129,12 @@ class TrainingRenderer:
                     view, pictures, camera, target, frame, instant, moment, other, then, order.seed,
                     model.placed,
                 )  # fmt: skip
-                loss = loss + weight * term(seen)
+                value = weight * term(seen)
+                loss, apart = (loss, apart + value) if term.of_canonical else (loss + value, apart)
+        of_splats = _gradients_of_splats(apart, model)
         gradients, on_screen = differentiate(loss, judged, frame, model, phase.screens)
+        gradients = [_plus(*both) for both in zip(gradients, of_splats, strict=True)]
+        loss = loss + apart
         size = camera.width, camera.height
         return ViewGradients(loss.detach(), gradients, on_screen, size, judged.errors)
 
@@ -203,6 +207,26 @@ class TrainingRenderer:
         if options.sh_start <= 0:
             return options.sh_degree
         return min(options.sh_degree, int(progress / options.sh_start))
+
+
+def _gradients_of_splats(loss: Tensor, model: Model) -> list[Tensor | None]:
+    """Return the gradients of a loss () by the stored splats, None for all else that is trained."""
+    trained = model.trained()
+    found: dict[str, Tensor | None] = dict.fromkeys(trained)
+    if loss.requires_grad:
+        own = {name: tensor for name, tensor in trained.items() if name.startswith(STORED_AS)}
+        found |= dict(
+            zip(
+                own,
+                torch.autograd.grad(loss, list(own.values()), retain_graph=True, allow_unused=True),
+                strict=True,
+            )
+        )
+    return list(found.values())
+
+
+def _plus(one: Tensor | None, other: Tensor | None) -> Tensor | None:
+    return one if other is None else other if one is None else one + other
 
 
 def _alike(cameras: Sequence[Camera], tile_weights: Sequence[Tensor | None]) -> bool:

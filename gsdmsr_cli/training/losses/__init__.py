@@ -73,8 +73,9 @@ class Term(ABC):
     Attributes:
         needs_depth: whether the frame is to have a depth.
         needs_seed: whether it makes random choices, which follow from ``Seen.seed``.
-        of_canonical: whether it is about where the canonical splats are, and has no part once they
-            stay as they are, as after the first moment of a stream.
+        of_canonical: whether it is about where the canonical splats are: its gradient reaches them
+            alone, no motion nor further layer, and it has no part once they stay as they are, as
+            after the first moment of a stream.
     """
 
     needs_depth: ClassVar[bool] = False

@@ -13,7 +13,7 @@ from datasets import noise, write_picture
 from training_checks import STEPS, preset_of, trainer_of
 
 from gsdmsr_cli.gaussians.moment import Moment
-from gsdmsr_cli.model.model import Model
+from gsdmsr_cli.model.model import STORED_AS, Model
 from gsdmsr_cli.raster import best_engine
 from gsdmsr_cli.scene.camera import Camera
 from gsdmsr_cli.scene.pictures import HalvedPictures, Pictures
@@ -80,7 +80,7 @@ def test_gradients_are_the_same_where_nobody_asks_for_those_on_the_screen(
         return grad(*given, **options)
 
     monkeypatch.setattr(torch.autograd, "grad", counted)
-    term = "losses.terms=[{name: inverse_depth}]"
+    term = "losses.terms=[{name: temporal_smoothness}]"
     trainer = trainer_of(tiny_scene, preset_of(term, "density.until=0.5"))
     found = []
     for screens in (True, False):
@@ -113,3 +113,26 @@ def test_those_on_the_screen_are_asked_for_while_splats_grow_or_are_gated(
             trainer.step()
         assert asked[-1][0] > 0.7
         assert asked == [(progress, progress < 0.4 or progress >= since) for progress, _ in asked]
+
+
+def test_terms_of_canonical_splats_move_nothing_else(tiny_scene: Path) -> None:
+    """Such a term would drag the motion along, which is what the pictures are to teach."""
+    found = {}
+    for terms in ("[]", "[{name: inverse_depth, factor: 1.0}]"):
+        trainer = trainer_of(tiny_scene, preset_of(f"losses.terms={terms}"))
+        trainer.population.begin_moving()
+        phase = Phase(0.9, moving=True)
+        (one,) = trainer.renderer.gradients(trainer.model, [Order(0)], phase)
+        found[terms] = dict(zip(trainer.model.trained(), one.gradients, strict=True)), one.loss
+    (without, loss), (pushed, more) = found.values()
+    assert float(more) != float(loss)
+    for name, gradient in without.items():
+        other = pushed[name]
+        if gradient is None or other is None:
+            assert gradient is other, name
+            continue
+        same = torch.allclose(gradient, other, rtol=1e-3, atol=1e-6 * float(gradient.abs().max()))
+        if name.endswith((".means", ".logit_opacities")):
+            assert not same, name
+        elif not name.startswith(STORED_AS):
+            assert same, name
