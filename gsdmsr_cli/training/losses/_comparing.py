@@ -18,7 +18,7 @@ from gsdmsr_cli.training.losses import Seen, Term
 
 @dataclass(frozen=True)
 class Schedule:
-    """Settings of every term that compares two times.
+    """Settings of every term that compares two times, and of others that end.
 
     Attributes:
         factor: weight of the term, above 0.
@@ -32,6 +32,10 @@ class Schedule:
         require(self, "factor", self.factor > 0, "a number above 0")
         require_progress(self, "until")
 
+    def weight(self, progress: float) -> float:
+        """Return the factor until the term ends, then 0."""
+        return self.factor if progress < self.until else 0.0
+
 
 class ComparingTerm(Term):
     """A term that is 0 where there is no second time, as in a scene of one moment."""
@@ -41,7 +45,7 @@ class ComparingTerm(Term):
 
     def weight(self, progress: float) -> float:
         """Return the factor until the term ends, then 0."""
-        return self.schedule.factor if progress < self.schedule.until else 0.0
+        return self.schedule.weight(progress)
 
     def other_time(
         self, view: View, times: Sequence[float], generator: torch.Generator

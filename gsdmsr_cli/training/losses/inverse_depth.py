@@ -14,9 +14,9 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from gsdmsr_cli.options.strict import require, require_progress
 from gsdmsr_cli.scene.scene import MASK
 from gsdmsr_cli.training.losses import Seen, Term
+from gsdmsr_cli.training.losses._comparing import Schedule
 
 LEAST_COVER = 0.05
 """Pixels count where the splats cover this much or more: elsewhere there is no depth."""
@@ -26,20 +26,10 @@ _NEAREST = 1e-6
 
 
 @dataclass(frozen=True)
-class Options:
-    """Settings.
-
-    Attributes:
-        factor: weight of the term.
-        until: progress up to which it counts.
-    """
+class Options(Schedule):
+    """See ``Schedule``."""
 
     factor: float = 0.03
-    until: float = 1.0
-
-    def __post_init__(self) -> None:
-        require(self, "factor", self.factor > 0, "a number above 0")
-        require_progress(self, "until")
 
 
 class InverseDepth(Term):
@@ -53,7 +43,7 @@ class InverseDepth(Term):
 
     def weight(self, progress: float) -> float:
         """Return the factor until the term ends, then 0."""
-        return self.options.factor if progress < self.options.until else 0.0
+        return self.options.weight(progress)
 
     def __call__(self, seen: Seen) -> Tensor:
         """Return log of the mean of alpha / (blended depth) over the pixels that count, ()."""
