@@ -24,7 +24,7 @@ from gsdmsr_cli.scene.scene import MOVING as MOVES
 from gsdmsr_cli.scene.scene import Scene
 from gsdmsr_cli.training import averaging, snapshot
 from gsdmsr_cli.training.gating import gates_of, observe_step
-from gsdmsr_cli.training.gradients.compare import gradients_of
+from gsdmsr_cli.training.gradients.compare import gradients_of, sum_of
 from gsdmsr_cli.training.gradients.phase import Order, Phase, ViewGradients
 from gsdmsr_cli.training.gradients.renderer import TrainingRenderer
 from gsdmsr_cli.training.gradients.tiles import TileSampler
@@ -433,14 +433,5 @@ def _set_gradients(model: Model, views: Sequence[ViewGradients], penalty: Penalt
         weight = PENALTY_EVERY * len(views)
         parts.append([None if part is None else part * weight for part in gradients])
     for tensor, *own in zip(model.trained().values(), *parts, strict=True):
-        tensor.grad = _sum(own)
+        tensor.grad = sum_of(own)
     return loss
-
-
-def _sum(parts: Sequence[Tensor | None]) -> Tensor | None:
-    """Return the sum of the parts that are there, in this order, or None."""
-    total: Tensor | None = None
-    for part in parts:
-        if part is not None:
-            total = part if total is None else total + part
-    return total

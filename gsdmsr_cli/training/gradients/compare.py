@@ -24,6 +24,15 @@ def gradients_of(loss: Tensor, model: Model) -> Sequence[Tensor | None]:
     return torch.autograd.grad(loss, list(model.trained().values()), allow_unused=True)
 
 
+def sum_of(parts: Sequence[Tensor | None]) -> Tensor | None:
+    """Return the sum of the parts that are there, in this order, or None."""
+    total: Tensor | None = None
+    for part in parts:
+        if part is not None:
+            total = part if total is None else total + part
+    return total
+
+
 def compare(
     engine: Engine,
     model: Model,

@@ -23,6 +23,7 @@ from gsdmsr_cli.training.gradients.compare import (
     compare_views,
     differentiate,
     draw_and_compare,
+    sum_of,
 )
 from gsdmsr_cli.training.gradients.phase import Order, Phase, ViewGradients
 from gsdmsr_cli.training.losses import Seen, start_term
@@ -133,7 +134,7 @@ class TrainingRenderer:
                 loss, apart = (loss, apart + value) if term.of_canonical else (loss + value, apart)
         of_splats = _gradients_of_splats(apart, model)
         gradients, on_screen = differentiate(loss, judged, frame, model, phase.screens)
-        gradients = [_plus(*both) for both in zip(gradients, of_splats, strict=True)]
+        gradients = [sum_of(both) for both in zip(gradients, of_splats, strict=True)]
         loss = loss + apart
         size = camera.width, camera.height
         return ViewGradients(loss.detach(), gradients, on_screen, size, judged.errors)
@@ -223,10 +224,6 @@ def _gradients_of_splats(loss: Tensor, model: Model) -> list[Tensor | None]:
             )
         )
     return list(found.values())
-
-
-def _plus(one: Tensor | None, other: Tensor | None) -> Tensor | None:
-    return one if other is None else other if one is None else one + other
 
 
 def _alike(cameras: Sequence[Camera], tile_weights: Sequence[Tensor | None]) -> bool:
