@@ -87,7 +87,7 @@ def load_model(
     progress: float,
     precision: str = "float32",
 ) -> Model:
-    """Rebuild a model from its saved tensors.
+    """Rebuild a model from its saved tensors, on the CPU, wherever these lie.
 
     Args:
         tensors: what ``Model.tensors`` returned, and ``MOVING`` if not all move, perhaps among
@@ -98,6 +98,7 @@ def load_model(
     Raises:
         DataError: a tensor is missing, or does not fit to the others or to the settings.
     """
+    tensors = {name: tensor.cpu() for name, tensor in tensors.items()}  # where layers begin
     try:
         splats = Splats(**below(STORED_AS, tensors))
     except (TypeError, ValueError) as error:

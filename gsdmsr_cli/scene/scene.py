@@ -109,7 +109,7 @@ class Scene:
             )
         return views
 
-    @property
+    @cached_property
     def radius(self) -> float:
         """Extent of the train cameras: 1.1 times the largest distance to their mean (3DGS).
 

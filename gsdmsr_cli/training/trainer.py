@@ -308,8 +308,9 @@ class Trainer:
             if weights is not None and errors is not None and bool(loss.isfinite()):
                 self.tiles.learn(order.row, weights, errors.cpu())
         if progress < self.preset.density.until:
+            valid = None if loss.is_cpu else loss * 0 + 1
             for view in views:
-                on_screen = view.on_screen if loss.is_cpu else view.on_screen * (loss * 0 + 1)
+                on_screen = view.on_screen if valid is None else view.on_screen * valid
                 self.population.statistics.observe(on_screen, *view.size)
 
     def _is_gated(self, progress: float) -> bool:

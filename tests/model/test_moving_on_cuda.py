@@ -33,7 +33,7 @@ def gradients(model: Model, moments: Sequence[Moment]) -> list[Tensor | None]:
 @pytest.mark.parametrize("progress", [0.0, 1.0])
 @pytest.mark.parametrize("mask", [None, LEARNT_FROM], ids=["all", "some"])
 @pytest.mark.parametrize("moving", [0, 30, 40])
-@pytest.mark.parametrize("name", ["multiscale", "hexplane"])
+@pytest.mark.parametrize("name", ["multiscale", "hexplane", "control_points"])
 def test_several_times_at_once(
     kernels_on_the_cpu: cuda_shim.Shim,
     monkeypatch: pytest.MonkeyPatch,

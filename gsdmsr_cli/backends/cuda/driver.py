@@ -56,7 +56,7 @@ class Driver:
         index = torch.cuda.current_device() if device.index is None else device.index
         self._enter(index)
         function = self._kernel(index, source, kernel)
-        stream = torch.cuda.current_stream(index).cuda_stream
+        stream = _current_stream(index)
         self._check(
             self._cuda.cuLaunchKernel(
                 function, *grid, 1, block, 1, 1, 0, stream, ctypes.addressof(arguments), None
@@ -107,6 +107,16 @@ class Driver:
             self._cuda.cuGetErrorString(status, byref(text))
             reason = (text.value or b"unknown error").decode()
             raise GsdmsrError(f"the NVIDIA driver failed when {doing}: {reason} ({status})")
+
+
+def _current_stream(index: int) -> int:
+    """Return the address of torch's current stream on a card.
+
+    What torch's own generated code asks: ``torch.cuda.current_stream`` makes an object of it, which
+    takes longer than the launch.
+    """
+    address: int = torch._C._cuda_getCurrentRawStream(index)
+    return address
 
 
 def built_for() -> int | None:

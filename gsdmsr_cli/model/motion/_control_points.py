@@ -17,6 +17,7 @@ from gsdmsr_cli.gaussians.splats import Splats
 from gsdmsr_cli.model.layer import Facts, Following, Instant, Layer
 from gsdmsr_cli.model.parameter import Parameter
 from gsdmsr_cli.ops import skin, spread
+from gsdmsr_cli.ops.choose import choose
 from gsdmsr_cli.ops.nearest import Nearest
 from gsdmsr_cli.options import strict
 
@@ -72,8 +73,12 @@ class ControlPoints(Layer):
         return spread.spacing(points).clamp(min=LEAST_SPACING * self.facts.bound).log()
 
     @abstractmethod
+    def _deformations(self, points: Tensor, times: Sequence[float]) -> Tensor:
+        """Return (T, M, 10) of points (M, 3) at times in [0, 1], see ``ops.skin.transforms``."""
+
     def _deformation(self, points: Tensor, time: float) -> Tensor:
-        """Return (M, 10) of points (M, 3) at a time in [0, 1], see ``ops.skin.transforms``."""
+        """Return (M, 10) of points (M, 3) at a time."""
+        return self._deformations(points, [time])[0]
 
     def at(self, moment: Moment, instant: Instant) -> Moment:
         """Return the moved splats."""
@@ -81,6 +86,21 @@ class ControlPoints(Layer):
         near = self._neighbours(moment.splats.means)
         given = self.control_points, self.log_radii, transforms, near
         return replace(moment, splats=skin.skin(moment.splats, *given))
+
+    def at_instants(self, moment: Moment, instants: Sequence[Instant]) -> list[Moment]:
+        """Return the moved splats at several times.
+
+        A GPU gets them by the launches of one time, since it mostly waits for the next launch.
+        On a CPU there is nothing to gain by it.
+        """
+        if len(instants) == 1 or choose(self.control_points) != "cuda":
+            return [self.at(moment, instant) for instant in instants]
+        deformations = self._deformations(self.control_points, [i.time for i in instants])
+        transforms = skin.transforms(self.control_points, deformations)
+        near = self._neighbours(moment.splats.means)
+        given = self.control_points, self.log_radii, transforms, near
+        moved = skin.skin_at_times(moment.splats, *given)
+        return [replace(moment, splats=splats) for splats in moved]
 
     def _transforms(self, points: Tensor, time: float) -> Tensor:
         return skin.transforms(points, self._deformation(points, time))

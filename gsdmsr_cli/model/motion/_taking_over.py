@@ -98,8 +98,11 @@ class TakingOver(Distilling):
         self.base.take(rows, fresh)
 
     def advance(self, progress: float) -> None:
-        """See, in a worker as well, whether it has taken over; if not, let the base go on."""
-        self.active = self.active or bool(self._taken_over)
+        """See, in a worker as well, whether it has taken over; if not, let the base go on.
+
+        Workers are processes of a CPU; a GPU is not waited for.
+        """
+        self.active = self.active or (self._taken_over.is_cpu and bool(self._taken_over))
         if not self.active and self.base is not None:
             self.base.advance(progress)
 

@@ -10,6 +10,7 @@ each of which moves its neighbourhood as a rigid body, has less freedom to do so
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -94,11 +95,11 @@ class ControlPointMotion(ControlPoints):
             left = 2 * (1 - progress / o.rigidity_until)
             self._rigidity = o.rigidity * min(max(left, 0.0), 1.0)
 
-    def _deformation(self, points: Tensor, time: float) -> Tensor:
+    def _deformations(self, points: Tensor, times: Sequence[float]) -> Tensor:
         """Return the outputs for points; times [0, 1] are mapped to the whole grid, [-1, 1]."""
-        place = 2 * self._place(time) - 1
-        features = planes.lookup(self.levels, points, place, self.facts.box)
-        return network.apply_network(self.layers, features)
+        places = [2 * self._place(time) - 1 for time in times]
+        features = planes.lookup_at_times(self.levels, points, places, self.facts.box)
+        return network.apply_network(self.layers, features).unflatten(0, (len(times), -1))
 
     def penalty(self, moment: Moment, instant: Instant, generator: torch.Generator) -> Tensor:
         """Return the plane regularisers, and the rigidity of control points at a random time.

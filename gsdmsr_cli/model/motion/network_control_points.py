@@ -11,6 +11,7 @@ beside their radii; splats of the first stage are not isotropic, and go on in th
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -84,9 +85,16 @@ class NetworkControlPoints(ControlPoints):
         shift = self._deformation(splats.means, instant.time)[:, : PARTS[0]]
         return replace(moment, splats=replace(splats, means=splats.means + shift))
 
-    def _deformation(self, points: Tensor, time: float) -> Tensor:
+    def at_instants(self, moment: Moment, instants: Sequence[Instant]) -> list[Moment]:
+        """Return what ``at`` does at several times."""
+        if self.progress >= self.options.alone_until:
+            return super().at_instants(moment, instants)
+        return [self.at(moment, instant) for instant in instants]
+
+    def _deformations(self, points: Tensor, times: Sequence[float]) -> Tensor:
         """Return the network's outputs, without a gradient for the points by way of it."""
-        return self.network.apply(points.detach() / self.facts.bound, [time])[0]
+        outputs = self.network.apply(points.detach() / self.facts.bound, times)
+        return outputs[0][None] if len(outputs) == 1 else torch.stack(outputs)
 
     def following(self) -> Following | None:
         """Return the control points, unless every splat is one by itself."""

@@ -29,11 +29,13 @@ def transforms(points: Tensor, deformation: Tensor) -> Tensor:
     Args:
         points: their canonical places.
         deformation: (M, 10) offset of the place, of the quaternion (1, 0, 0, 0), which is then of
-            unit length, and of the log scales.
+            unit length, and of the log scales; or (T, M, 10) of these, for (T, M, 19).
     """
     form = choose(points, deformation)
     if form == "cuda":
         return cuda.transforms(points, deformation, kernels.SHORTEST)
+    if deformation.dim() == 3:
+        return torch.stack([transforms(points, own) for own in deformation])
     if form == "cpu":
         made: Tensor = _Transform.apply(points, deformation)
         return made
@@ -56,15 +58,33 @@ def skin(
     by = points, log_radii, transforms, near
     form = choose(*stored, *by[:3])
     if form == "cuda":
-        means, quats, log_scales = cuda.skin(stored, *by)
-    elif form == "cpu":
-        means, quats, log_scales = _Skin.apply(*stored, *by)
-    else:
+        return skin_at_times(splats, points, log_radii, transforms[None], near)[0]
+    if form == "twin":
         return skin_twin(splats, *by)
+    means, quats, log_scales = _Skin.apply(*stored, *by)
     return replace(splats, means=means, quats=quats, log_scales=log_scales)
 
 
-__all__ = ["COLUMNS", "skin", "skin_twin", "transforms", "transforms_twin"]
+def skin_at_times(
+    splats: Splats, points: Tensor, log_radii: Tensor, transforms: Tensor, near: Tensor
+) -> list[Splats]:
+    """Return what ``skin`` does at each of T times, by one launch on a GPU.
+
+    Args:
+        splats, points, log_radii, near: as there.
+        transforms: (T, M, 19), of each time.
+    """
+    stored = splats.means, splats.quats, splats.log_scales
+    if choose(*stored, points, log_radii, transforms) != "cuda":
+        return [skin(splats, points, log_radii, own, near) for own in transforms]
+    moved = (part.unbind() for part in cuda.skin(stored, points, log_radii, transforms, near))
+    return [
+        replace(splats, means=means, quats=quats, log_scales=log_scales)
+        for means, quats, log_scales in zip(*moved, strict=True)
+    ]
+
+
+__all__ = ["COLUMNS", "skin", "skin_at_times", "skin_twin", "transforms", "transforms_twin"]
 
 
 class _Transform(Function):

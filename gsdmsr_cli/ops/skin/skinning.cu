@@ -28,14 +28,15 @@ __device__ __forceinline__ Quat turn_of(const float *deformation, float shortest
     return {w / norm, x / norm, y / norm, z / norm, norm};
 }
 
-// Writes what control points do to the splats that follow them, (count, 19), from their places and deformations
-// (count, 10): offsets of place, of the quaternion (1, 0, 0, 0), of log scales. It counts as `shortest` long at least.
+// Writes what control points do at some times to the splats that follow them, (times, size, 19), from their places
+// and deformations (times, size, 10): offsets of place, of the quaternion (1, 0, 0, 0), of log scales. The quaternion
+// counts as `shortest` long at least; count is times * size.
 extern "C" __global__ void __launch_bounds__(THREADS) transform(
-    int count, float shortest, const float *points, const float *deformation, float *transforms
+    int count, int size, float shortest, const float *points, const float *deformation, float *transforms
 ) {
     int j = blockIdx.x * THREADS + threadIdx.x;
     if (j >= count) return;
-    const float *point = points + 3 * (size_t)j, *d = deformation + 10 * (size_t)j;
+    const float *point = points + 3 * (size_t)(j % size), *d = deformation + 10 * (size_t)j;
     float *out = transforms + COLUMNS * (size_t)j;
     Quat q = turn_of(d, shortest);
     float m[9] = {
@@ -57,14 +58,14 @@ extern "C" __global__ void __launch_bounds__(THREADS) transform(
     out[QUAT] = q.w - 1.0f, out[QUAT + 1] = q.x, out[QUAT + 2] = q.y, out[QUAT + 3] = q.z;
 }
 
-// Writes the gradients of that, d_points (count, 3) and d_deformation (count, 10).
+// Writes the gradients of that, d_points (times, size, 3) and d_deformation (times, size, 10).
 extern "C" __global__ void __launch_bounds__(THREADS) transform_backward(
-    int count, float shortest, const float *points, const float *deformation,
+    int count, int size, float shortest, const float *points, const float *deformation,
     const float *transforms, const float *d_transforms, float *d_points, float *d_deformation
 ) {
     int j = blockIdx.x * THREADS + threadIdx.x;
     if (j >= count) return;
-    const float *point = points + 3 * (size_t)j, *t = transforms + COLUMNS * (size_t)j;
+    const float *point = points + 3 * (size_t)(j % size), *t = transforms + COLUMNS * (size_t)j;
     const float *given = d_transforms + COLUMNS * (size_t)j;
     float *out = d_deformation + 10 * (size_t)j;
     float m[9];
@@ -109,10 +110,10 @@ __device__ __forceinline__ void blend_into(
     }
 }
 
-// Writes n splats where their points take them, and weights (n, kept): softmax(-d^2 / (2 r^2)) of the distances
-// d to the points and their radii r.
+// Writes n splats where their points take them at each time, (times, n, ...), and weights (n, kept), the same at all
+// times: softmax(-d^2 / (2 r^2)) of the distances d to the points and their radii r. There are `size` points.
 extern "C" __global__ void __launch_bounds__(THREADS) skin(
-    int n, int kept, const float *means, const float *quats, const float *log_scales,
+    int n, int kept, int times, int size, const float *means, const float *quats, const float *log_scales,
     const float *points, const float *log_radii, const float *transforms, const int *near,
     float *weights, float *moved, float *turned, float *scaled
 ) {
@@ -133,20 +134,24 @@ extern "C" __global__ void __launch_bounds__(THREADS) skin(
         total += weight[k];
     }
     for (int k = 0; k < kept; k++) weight[k] /= total;
-    float t[COLUMNS];
-    blend_into(t, transforms, kept, own, weight);
-#pragma unroll
-    for (int r = 0; r < 3; r++) {
-        float shift = t[OFFSET + r] + t[3 * r] * x + t[3 * r + 1] * y + t[3 * r + 2] * z;
-        moved[three + r] = means[three + r] + shift;
-        scaled[three + r] = log_scales[three + r] + t[GROWTH + r];
-    }
-    float a = t[QUAT], b = t[QUAT + 1], c = t[QUAT + 2], d = t[QUAT + 3];
     float qw = quats[four], qx = quats[four + 1], qy = quats[four + 2], qz = quats[four + 3];
-    turned[four] = qw + (a * qw - b * qx - c * qy - d * qz);
-    turned[four + 1] = qx + (a * qx + b * qw + c * qz - d * qy);
-    turned[four + 2] = qy + (a * qy - b * qz + c * qw + d * qx);
-    turned[four + 3] = qz + (a * qz + b * qy - c * qx + d * qw);
+    for (int time = 0; time < times; time++) {
+        float t[COLUMNS];
+        blend_into(t, transforms + COLUMNS * (size_t)time * size, kept, own, weight);
+        size_t row = (size_t)time * n + i;
+        float *place = moved + 3 * row, *scale = scaled + 3 * row, *quat = turned + 4 * row;
+#pragma unroll
+        for (int r = 0; r < 3; r++) {
+            float shift = t[OFFSET + r] + t[3 * r] * x + t[3 * r + 1] * y + t[3 * r + 2] * z;
+            place[r] = means[three + r] + shift;
+            scale[r] = log_scales[three + r] + t[GROWTH + r];
+        }
+        float a = t[QUAT], b = t[QUAT + 1], c = t[QUAT + 2], d = t[QUAT + 3];
+        quat[0] = qw + (a * qw - b * qx - c * qy - d * qz);
+        quat[1] = qx + (a * qx + b * qw + c * qz - d * qy);
+        quat[2] = qy + (a * qy - b * qz + c * qw + d * qx);
+        quat[3] = qz + (a * qz + b * qy - c * qx + d * qw);
+    }
 }
 
 // What a splat passes on: gradients of the transform it follows, 19 of them from `row` on in shared memory,
@@ -198,12 +203,12 @@ __device__ __forceinline__ void add_rows(
     }
 }
 
-// Writes the gradients of that by means and quaternions, and adds those by the points to sums (count, 24),
-// which begin as 0. That of log scales is d_scaled.
+// Writes the gradients of that by means and quaternions, sums over the times, and adds those by the points to sums
+// (times, size, 24), which begin as 0. That of log scales is the sum of d_scaled.
 //
 // A splat that is given no gradient adds nothing, whatever its values are: 0 times NaN would be NaN.
 extern "C" __global__ void __launch_bounds__(THREADS) skin_backward(
-    int n, int kept, const float *means, const float *quats, const float *points,
+    int n, int kept, int times, int size, const float *means, const float *quats, const float *points,
     const float *log_radii, const float *transforms, const int *near, const float *weights,
     const float *d_moved, const float *d_turned, const float *d_scaled, float *d_means,
     float *d_quats, float *sums
@@ -213,48 +218,59 @@ extern "C" __global__ void __launch_bounds__(THREADS) skin_backward(
     int i = blockIdx.x * THREADS + threadIdx.x, warp = threadIdx.x / WARP, lane = threadIdx.x % WARP;
     size_t at = i < n ? i : 0;
     float *row = all_rows[warp][lane];
-    const float *moved = d_moved + 3 * at, *turned = d_turned + 4 * at, *scaled = d_scaled + 3 * at;
-    bool own = false;
-#pragma unroll
-    for (int r = 0; r < 3; r++) own |= i < n && (moved[r] != 0.0f || scaled[r] != 0.0f);
-#pragma unroll
-    for (int r = 0; r < 4; r++) own |= i < n && turned[r] != 0.0f;
     const float *mean = means + 3 * at, *weight = weights + at * kept;
     const int *rows_of_nodes = near + at * kept;
-    float x = mean[0], y = mean[1], z = mean[2], average = 0.0f;
-    float pulled[3] = {}, by_mean[3] = {}, passed[4] = {};
-    if (own) {
-        float t[COLUMNS];
-        blend_into(t, transforms, kept, rows_of_nodes, weight);
-        average = pass_on(t, x, y, z, quats + 4 * at, moved, turned, scaled, row, by_mean, passed);
-    }
-    unsigned taught = __ballot_sync(ALL_LANES, own);
-    for (int k = 0; k < kept; k++) {
-        __syncwarp();
+    float x = mean[0], y = mean[1], z = mean[2];
+    float by_mean[3] = {}, by_quat[4] = {};
+    for (int time = 0; time < times; time++) {
+        size_t then = (size_t)time * n + at;
+        const float *moved = d_moved + 3 * then, *turned = d_turned + 4 * then, *scaled = d_scaled + 3 * then;
+        const float *transforms_then = transforms + COLUMNS * (size_t)time * size;
+        float average = 0.0f;
+        bool own = false;
+#pragma unroll
+        for (int r = 0; r < 3; r++) own |= i < n && (moved[r] != 0.0f || scaled[r] != 0.0f);
+#pragma unroll
+        for (int r = 0; r < 4; r++) own |= i < n && turned[r] != 0.0f;
         if (own) {
-            int j = rows_of_nodes[k];
-            const float *point = points + 3 * (size_t)j, *transform = transforms + COLUMNS * (size_t)j;
-            float total = 0.0f;
+            float t[COLUMNS], passed[7];
+            blend_into(t, transforms_then, kept, rows_of_nodes, weight);
+            average = pass_on(t, x, y, z, quats + 4 * at, moved, turned, scaled, row, passed, passed + 3);
 #pragma unroll
-            for (int s = 0; s < COLUMNS; s++) total += transform[s] * row[s];
-            float given = weight[k] * (total - average) * sharpness_of(log_radii[j]);
-            float away[3] = {x - point[0], y - point[1], z - point[2]};
+            for (int r = 0; r < 3; r++) by_mean[r] += passed[r];
 #pragma unroll
-            for (int s = 0; s < 3; s++) {
-                row[COLUMNS + s] = given * away[s];
-                pulled[s] += given * away[s];
-            }
-            row[COLUMNS + 3] = given * (away[0] * away[0] + away[1] * away[1] + away[2] * away[2]);
-            all_weights[threadIdx.x] = weight[k];
-            all_followed[threadIdx.x] = j;
+            for (int r = 0; r < 4; r++) by_quat[r] += passed[3 + r];
         }
-        __syncwarp();
-        const float *weights_there = all_weights + warp * WARP;
-        add_rows(all_rows[warp], all_followed + warp * WARP, weights_there, taught, lane, sums);
+        unsigned taught = __ballot_sync(ALL_LANES, own);
+        for (int k = 0; k < kept; k++) {
+            __syncwarp();
+            if (own) {
+                int j = rows_of_nodes[k];
+                const float *point = points + 3 * (size_t)j, *transform = transforms_then + COLUMNS * (size_t)j;
+                float total = 0.0f;
+#pragma unroll
+                for (int s = 0; s < COLUMNS; s++) total += transform[s] * row[s];
+                float given = weight[k] * (total - average) * sharpness_of(log_radii[j]);
+                float away[3] = {x - point[0], y - point[1], z - point[2]};
+#pragma unroll
+                for (int s = 0; s < 3; s++) {
+                    row[COLUMNS + s] = given * away[s];
+                    by_mean[s] -= given * away[s];
+                }
+                row[COLUMNS + 3] = given * (away[0] * away[0] + away[1] * away[1] + away[2] * away[2]);
+                all_weights[threadIdx.x] = weight[k];
+                all_followed[threadIdx.x] = j;
+            }
+            __syncwarp();
+            const float *weights_there = all_weights + warp * WARP;
+            float *sums_then = sums + SUMS * (size_t)time * size;
+            add_rows(all_rows[warp], all_followed + warp * WARP, weights_there, taught, lane, sums_then);
+        }
+        __syncwarp();  // rows are read by all lanes before the next time's are written
     }
     if (i >= n) return;
 #pragma unroll
-    for (int r = 0; r < 3; r++) d_means[3 * at + r] = by_mean[r] - pulled[r];
+    for (int r = 0; r < 3; r++) d_means[3 * at + r] = by_mean[r];
 #pragma unroll
-    for (int r = 0; r < 4; r++) d_quats[4 * at + r] = passed[r];
+    for (int r = 0; r < 4; r++) d_quats[4 * at + r] = by_quat[r];
 }

@@ -15,6 +15,7 @@ from torch import Tensor
 from gsdmsr_cli.backends.cuda import launch
 from gsdmsr_cli.gaussians.splats import Splats
 from gsdmsr_cli.ops import skin as skinning
+from gsdmsr_cli.ops.displace import OUTPUTS
 from gsdmsr_cli.ops.nearest import nearest_points
 
 pytestmark = pytest.mark.usefixtures("kernels_on_the_cpu")
@@ -135,6 +136,35 @@ def test_following_and_its_gradients(
     for i, (one, truth, other) in enumerate(zip(found, exact, cpu, strict=True)):
         assert_near(one, truth, TOLERANCE, f"result {i}")
         assert_near(one, other, TOLERANCE, f"result {i} of the CPU's kernels")
+
+
+@pytest.mark.parametrize("times", [1, 3])
+@pytest.mark.parametrize("count", COUNTS)
+def test_several_times_are_one_after_the_other(
+    place: str, turns: None, count: int, times: int
+) -> None:
+    """What is learnt at each time from some splats, from others at others, as the twin learns."""
+    rng = generator(7)
+    deformations = torch.randn(times, 45, OUTPUTS, generator=rng)
+    slopes = torch.randn(times, count, 10, generator=rng)
+    slopes[torch.arange(times)[:, None] == torch.arange(count) % 4] = 0
+    results = []
+    for dtype, on in ((torch.float32, place), (torch.float64, "cpu")):
+        splats, points = splats_of(count), control_points_of(45)
+        near = nearest_points(splats.means.double(), points[0].double(), guesses(count, 8))
+        given = [splats.means, splats.quats, splats.log_scales, *points[:2], deformations]
+        own = leaves(given, dtype)
+        *stored, places, log_radii, moves = (t.to(on) for t in own)
+        made = skinning.transforms(places, moves)
+        still = Splats(*stored, *(t.to(on) for t in (splats.logit_opacities, splats.sh)))
+        moved = skinning.skin_at_times(still, places, log_radii, made, near.to(on))
+        assert len(moved) == times
+        rows = [torch.cat([m.means, m.quats, m.log_scales], dim=1) for m in moved]
+        parts = torch.stack(rows).cpu()
+        parts.backward(slopes.to(dtype))
+        results.append([made.cpu(), parts, *(t.grad for t in own)])
+    for i, (found, exact) in enumerate(zip(*results, strict=True)):
+        assert_near(found, exact, TOLERANCE, f"result {i}")
 
 
 def test_splats_that_are_not_finite_teach_nothing(turns: None) -> None:
