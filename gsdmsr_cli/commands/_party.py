@@ -72,7 +72,7 @@ def require_alone(party: Party) -> None:
 
 def require_suited(party: Party, options: Preset, device: str) -> None:
     """Raise UsageError if the ranks cannot share the steps of a training with these options."""
-    size, views = party.ranks.size, options.training.views_per_step
+    size, views = party.ranks.size, options.training.views_on(device)
     if size > 1 and device != "cpu":
         raise UsageError(
             f"{size} ranks train on CPUs alone: sums of a GPU differ from rank to rank; give "

@@ -25,7 +25,7 @@ def say_plan(trainer: Trainer, name: str, reason: str | None, device: str) -> No
     changed = {o["key"]: o["value"] for o in described if o["value"] != o["default"]}
     views = trainer.scene.split("train")
     camera = trainer.renderer.pictures.camera(views[0])
-    processes = processes_for(options.training.views_per_step) if device == "cpu" else 1
+    processes = processes_for(trainer.views_per_step) if device == "cpu" else 1
     plan: dict[str, Any] = {
         "preset": name,
         "reason": reason,

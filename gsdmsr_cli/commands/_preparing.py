@@ -95,7 +95,7 @@ def timed(work: Callable[[], T]) -> tuple[T, float]:
 
 def _warn_of_memory(scene: Scene, options: Preset, party: Party, device: str) -> None:
     """Say so if the training may take more memory than there is."""
-    views = most_of(options.training.views_per_step, party.ranks.size)
+    views = most_of(options.training.views_on(device), party.ranks.size)
     processes = processes_for(views) if device == "cpu" else 1
     expected = memory.estimate(scene.split("train"), options, processes)
     text = memory.warning(expected, limits.available_memory())

@@ -27,6 +27,9 @@ from gsdmsr_cli.options.strict import (
 EVENTS = ("density", "opacity_reset", "thinning", "stillness")
 """Events that every training asks after a step, unless the preset says otherwise."""
 
+VIEWS_OF_A_CPU, VIEWS_OF_A_GPU = 2, 8
+"""Views of a step, where options do not say; docs/gpu.md has the evidence."""
+
 BACKGROUNDS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
 """The colours that pictures may be laid on."""
 
@@ -101,7 +104,8 @@ class TrainingOptions:
             time, as they have where steps count.
         static_until: progress up to which nothing moves.
         static_steps: most steps for which nothing moves.
-        views_per_step: pictures drawn and compared per step, 1 to 16.
+        views_per_step: pictures drawn and compared per step, 1 to 16; null is what suits the
+            device, see ``views_on``.
         tiles_per_view: tiles of 16 x 16 px that are chosen of each, once SSIM does not count any
             more; 0 is all.
         low_resolution_until: progress up to which pictures of half the size are drawn; 0 is never.
@@ -128,7 +132,7 @@ class TrainingOptions:
     budget_power: float = 1.0
     static_until: float = 0.04
     static_steps: int = 300
-    views_per_step: int = 2
+    views_per_step: int | None = None
     tiles_per_view: int = 0
     low_resolution_until: float = 0.3
     window: float = 1.0
@@ -146,7 +150,7 @@ class TrainingOptions:
     def __post_init__(self) -> None:
         require_at_least(self, 1, "steps", "keep")
         # the limit of a GPU is that of the CPU as well: a training may go on on the other
-        within = 1 <= self.views_per_step <= MOST_VIEWS
+        within = self.views_per_step is None or 1 <= self.views_per_step <= MOST_VIEWS
         require(self, "views_per_step", within, f"1 to {MOST_VIEWS}")
         require_duration(self, "budget")
         require(self, "budget_power", 0.1 <= self.budget_power <= 10, "0.1 to 10")
@@ -158,6 +162,16 @@ class TrainingOptions:
         require_positive(self, "checkpoint_minutes")
         require(self, "seed", 0 <= self.seed < 2**32, "0 to 4294967295")
         require_at_least(self, 0, "static_steps", "threads", "tiles_per_view")
+
+    def views_on(self, device: str) -> int:
+        """Return how many views a step has on a device such as "cpu".
+
+        A CPU takes twice as long for twice as many. A GPU waits for the next launch most of the
+        time, so that further views cost it little.
+        """
+        if self.views_per_step is not None:
+            return self.views_per_step
+        return VIEWS_OF_A_CPU if device == "cpu" else VIEWS_OF_A_GPU
 
     @property
     def progress_power(self) -> float:

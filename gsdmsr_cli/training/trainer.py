@@ -67,6 +67,7 @@ class Trainer:
         clock: steps, time and progress.
         renderer: renders views and goes backward.
         ranks: the processes that make the steps together, perhaps on other machines.
+        views_per_step: how many views a step has.
         workers: the processes that take gradients; this one alone until ``start_workers``.
         events: what changes the splats after a step, by name, in their order.
         stopwatch: adds up what the time goes into.
@@ -87,6 +88,7 @@ class Trainer:
     ) -> None:
         self.ranks = ranks
         self.scene, self.preset, self.device = scene, preset, torch.device(device)
+        self.views_per_step = preset.training.views_on(self.device.type)
         self.views = scene.split("train")
         self.renderer = TrainingRenderer(preset, engine, pictures, self.views, device)
         self.workers = WorkerPool(self.renderer)
@@ -157,7 +159,7 @@ class Trainer:
     def start_workers(self, prepare: Callable[[], object]) -> None:
         """Get workers for a step's views, until the context ends; see ``WorkerPool.start``."""
         capacity = max(self.preset.density.cap, len(self.model.splats))
-        views = most_of(self.preset.training.views_per_step, self.ranks.size)
+        views = most_of(self.views_per_step, self.ranks.size)
         self.workers.start(self.model, capacity, views, prepare)
 
     def step(self) -> Step:
@@ -245,7 +247,7 @@ class Trainer:
 
     def _choose_views(self, progress: float) -> list[Order]:
         """Return the views of a step, with all random choices that each needs."""
-        rows = [self._next_row(progress) for _ in range(self.preset.training.views_per_step)]
+        rows = [self._next_row(progress) for _ in range(self.views_per_step)]
         return [self._order(row, progress) for row in rows]
 
     def _next_row(self, progress: float) -> int:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from gsdmsr_cli.backends.cuda.compiler import MOST_VIEWS
 from gsdmsr_cli.ground.errors import UsageError
 from gsdmsr_cli.options import preset_files, strict
 from gsdmsr_cli.options.preset import Preset, TrainingOptions, load_preset
@@ -275,3 +276,11 @@ def test_options_under_the_earlier_name_add_to_those_under_the_present_one(prese
     write(presets, "low", "motion: {name: control_points, count: 64}")
     motion = load_preset("low", None, ["motion={name: nodes, neighbours: 4}"]).motion
     assert motion == {"name": "control_points", "count": 64, "neighbours": 4}
+
+
+def test_a_step_has_the_views_that_suit_the_device_unless_options_say() -> None:
+    training = load_preset("dnerf", None, []).training
+    assert training.views_per_step is None
+    assert training.views_on("cpu") < training.views_on("cuda") <= MOST_VIEWS
+    chosen = load_preset("dnerf", None, ["training.views_per_step=3"]).training
+    assert chosen.views_on("cpu") == chosen.views_on("cuda") == 3

@@ -67,8 +67,6 @@ def test_every_preset_trains_and_goes_on(tiny_scene: Path, name: str) -> None:
 @pytest.mark.parametrize("way", WAYS)
 def test_every_way_of_streaming_goes_from_moment_to_moment(rig: Path, way: str) -> None:
     preset, scene = load_preset(way, None, OF_STREAMS), read_scene(rig)
-    with StreamTrainer(
-        scene, preset, best_engine(DEVICE), pictures_of(preset), DEVICE
-    ) as trainer:
+    with StreamTrainer(scene, preset, best_engine(DEVICE), pictures_of(preset), DEVICE) as trainer:
         through(trainer, 2)
         assert all(tensor.isfinite().all() for tensor in trainer.model.trained().values())

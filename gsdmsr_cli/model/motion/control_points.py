@@ -99,7 +99,8 @@ class ControlPointMotion(ControlPoints):
         """Return the outputs for points; times [0, 1] are mapped to the whole grid, [-1, 1]."""
         places = [2 * self._place(time) - 1 for time in times]
         features = planes.lookup_at_times(self.levels, points, places, self.facts.box)
-        return network.apply_network(self.layers, features).unflatten(0, (len(times), -1))
+        outputs = network.apply_network(self.layers, features)
+        return outputs.view(len(times), len(points), OUTPUTS)
 
     def penalty(self, moment: Moment, instant: Instant, generator: torch.Generator) -> Tensor:
         """Return the plane regularisers, and the rigidity of control points at a random time.
