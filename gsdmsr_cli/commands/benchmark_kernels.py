@@ -43,7 +43,7 @@ def run(yardstick_folder: Path | None, device: str) -> None:
             rows += _measure(size, count, where, other)
     usage = availability.usage(where)
     document = {"schema": 1, "threads": threads(), "device": where, **usage, "rows": rows}
-    say.result(document, _table(rows, usage["gpu"] or f"{threads()} threads"))
+    say.result(document, _table(rows, _where(usage)))
 
 
 def _yardstick(folder: Path | None, device: str) -> Any:
@@ -82,6 +82,13 @@ def _measure(size: int, count: int, device: str, other: Any) -> list[dict[str, A
             row |= {"yardstick_ms": times[against], "ratio": times[name] / times[against]}
         rows.append(row)
     return rows
+
+
+def _where(usage: dict[str, Any]) -> str:
+    """Return on what was measured, and how much of a GPU's memory tensors have taken at most."""
+    if usage["gpu"] is None:
+        return f"{threads()} threads"
+    return f"{usage['gpu']}, {usage['peak_gpu_mib']:,.0f} MiB of its memory at most"
 
 
 def _table(rows: list[dict[str, Any]], on: str) -> Table:

@@ -27,8 +27,11 @@ from gsdmsr_cli.options.strict import (
 EVENTS = ("density", "opacity_reset", "thinning", "stillness")
 """Events that every training asks after a step, unless the preset says otherwise."""
 
-VIEWS_OF_A_CPU, VIEWS_OF_A_GPU = 2, 8
-"""Views of a step, where options do not say; docs/gpu.md has the evidence."""
+VIEWS, VIEWS_AT_ONCE = 2, 8
+"""Views of a step, where options do not say: usually, and where a GPU draws all of them at once.
+
+docs/gpu.md has the evidence.
+"""
 
 BACKGROUNDS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
 """The colours that pictures may be laid on."""
@@ -163,15 +166,15 @@ class TrainingOptions:
         require(self, "seed", 0 <= self.seed < 2**32, "0 to 4294967295")
         require_at_least(self, 0, "static_steps", "threads", "tiles_per_view")
 
-    def views_on(self, device: str) -> int:
+    def views_on(self, device: str, at_once: bool = True) -> int:
         """Return how many views a step has on a device such as "cpu".
 
         A CPU takes twice as long for twice as many. A GPU waits for the next launch most of the
-        time, so that further views cost it little.
+        time, so that further views cost it little, where they are drawn ``at_once``.
         """
         if self.views_per_step is not None:
             return self.views_per_step
-        return VIEWS_OF_A_CPU if device == "cpu" else VIEWS_OF_A_GPU
+        return VIEWS_AT_ONCE if device != "cpu" and at_once else VIEWS
 
     @property
     def progress_power(self) -> float:

@@ -88,7 +88,6 @@ class Trainer:
     ) -> None:
         self.ranks = ranks
         self.scene, self.preset, self.device = scene, preset, torch.device(device)
-        self.views_per_step = preset.training.views_on(self.device.type)
         self.views = scene.split("train")
         self.renderer = TrainingRenderer(preset, engine, pictures, self.views, device)
         self.workers = WorkerPool(self.renderer)
@@ -108,6 +107,8 @@ class Trainer:
             precision=preset.training.precision, times=times,
             views=[(view.camera, view.time) for view in self.views],
         )  # fmt: skip
+        at_once = self.renderer.renders_at_once(model)
+        self.views_per_step = preset.training.views_on(self.device.type, at_once)
         self.optimizer = Adam()
         self.saliency = Saliency(len(splats), preset.saliency, device)
         self.events = start_events(preset)

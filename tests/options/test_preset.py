@@ -282,5 +282,6 @@ def test_a_step_has_the_views_that_suit_the_device_unless_options_say() -> None:
     training = load_preset("dnerf", None, []).training
     assert training.views_per_step is None
     assert training.views_on("cpu") < training.views_on("cuda") <= MOST_VIEWS
+    assert training.views_on("cuda", at_once=False) == training.views_on("cpu")
     chosen = load_preset("dnerf", None, ["training.views_per_step=3"]).training
     assert chosen.views_on("cpu") == chosen.views_on("cuda") == 3

@@ -241,3 +241,21 @@ def test_camera_sizes_decide_whether_views_go_together(tiny_scene: Path) -> None
     assert _alike([first, second], [weights, weights])
     assert not _alike([first, replace(second, width=10)], [None, None])
     assert not _alike([first, second], [None, weights])
+
+
+@pytest.mark.parametrize(
+    ("option", "views"),
+    [
+        ("training.views_per_step=null", 8),
+        ("training.views_per_step=5", 5),
+        ("losses.terms=[{name: temporal_smoothness}]", 2),
+        ("layers=[{name: exposure}]", 2),
+        ("losses.inliers=0.9", 2),
+    ],
+)
+def test_a_step_has_more_views_where_they_are_drawn_at_once(
+    tiny_scene: Path, nobody: Nobody, option: str, views: int
+) -> None:
+    preset = preset_of("training.views_per_step=null", option)
+    assert elsewhere(tiny_scene, preset).views_per_step == views
+    assert trainer_of(tiny_scene, preset).views_per_step == (views if views == 5 else 2)

@@ -59,6 +59,15 @@ class TrainingRenderer:
         for term in self.terms:
             term.cache_in(folder)
 
+    def renders_at_once(self, model: Model) -> bool:
+        """Return whether the views of a step are rendered at once in all phases of the training.
+
+        If their pictures are of one size, and the engine can.
+        """
+        losses = self.preset.losses
+        whole = not any(MASK in view.signals for view in self.views)
+        return whole and not (losses.terms or losses.inliers < 1 or model.shades)
+
     def gradients(self, model: Model, orders: Sequence[Order], phase: Phase) -> list[ViewGradients]:
         """Return what each of the ordered views says of the model.
 
