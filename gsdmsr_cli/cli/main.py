@@ -213,8 +213,8 @@ def _explain(error: Exception) -> tuple[str, int]:
         return f"{where}{error.strerror}; free space or choose another place", 3
     if type(error).__name__ == "OutOfMemoryError":  # torch's, which is not imported here
         return (
-            "the GPU's memory is full; lower --set density.cap=..., raise --downscale, lower "
-            "--set data.cache_mib=..., or use --device cpu"
+            "the GPU's memory is full; lower --set training.views_per_step=..., --set "
+            "data.cache_mib=... or --set density.cap=..., raise --downscale, or use --device cpu"
         ), 3
     hint = "set GSDMSR_DEBUG=1 for the traceback"
     return f"internal: {type(error).__name__}: {error} ({hint})", 1

@@ -159,8 +159,8 @@ def test_usage_errors_are_one_line_and_exit_2(
         (
             torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB"),
             3,
-            "the GPU's memory is full; lower --set density.cap=..., raise --downscale, lower --set "
-            "data.cache_mib=..., or use --device cpu",
+            "the GPU's memory is full; lower --set training.views_per_step=..., --set "
+            "data.cache_mib=... or --set density.cap=..., raise --downscale, or use --device cpu",
         ),
         (
             ZeroDivisionError("division by zero"),
