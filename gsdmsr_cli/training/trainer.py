@@ -171,7 +171,8 @@ class Trainer:
         gated = self._is_gated(progress)
         mask = self.saliency.gradient_mask(self.clock.step) if gated else None
         screens = gated or progress < self.preset.density.until
-        phase = Phase(progress, self.population.moving, mask, self.frozen, screens)
+        moving, step = self.population.moving, self.clock.step
+        phase = Phase(progress, moving, mask, self.frozen, screens, step)
         with self._choices_that_count():
             orders = self._choose_views(progress)
             with self.stopwatch.of("gradients"):

@@ -18,6 +18,7 @@ class Phase(NamedTuple):
         gradient_mask: (N,) bool, the splats whose gradients reach layers, see ``Model.at``.
         frozen: whether the canonical splats stay as they are, as after a stream's first moment.
         screens: whether anybody asks for the gradients on the screen.
+        step: how many steps have been made.
     """
 
     progress: float
@@ -25,6 +26,7 @@ class Phase(NamedTuple):
     gradient_mask: Tensor | None = None
     frozen: bool = False
     screens: bool = True
+    step: int = 0
 
 
 class Order(NamedTuple):

@@ -149,9 +149,11 @@ class TrainingRenderer:
         return ViewGradients(loss.detach(), gradients, on_screen, size, judged.errors)
 
     def _weights(self, phase: Phase) -> list[float]:
-        """Return the factor of each term."""
+        """Return the factor of each term in this step."""
         return [
-            0.0 if phase.frozen and term.of_canonical else term.weight(phase.progress)
+            0.0
+            if phase.step % term.every or (phase.frozen and term.of_canonical)
+            else term.every * term.weight(phase.progress)
             for term in self.terms
         ]
 

@@ -76,11 +76,13 @@ class Term(ABC):
         of_canonical: whether it is about where the canonical splats are: its gradient reaches them
             alone, no motion nor further layer, and it has no part once they stay as they are, as
             after the first moment of a stream.
+        every: in every how many-th step it counts, as many times; in the others it costs nothing.
     """
 
     needs_depth: ClassVar[bool] = False
     needs_seed: ClassVar[bool] = False
     of_canonical: ClassVar[bool] = False
+    every: int = 1
 
     def weight(self, progress: float) -> float:
         """Return the factor of the term at ``progress`` in [0, 1]; with 0 it costs nothing."""

@@ -23,14 +23,17 @@ class Schedule:
     Attributes:
         factor: weight of the term, above 0.
         until: progress up to which it counts.
+        every: in every how many-th step it counts, with as many times the factor.
     """
 
     factor: float = 0.01
     until: float = 1.0
+    every: int = 1
 
     def __post_init__(self) -> None:
         require(self, "factor", self.factor > 0, "a number above 0")
         require_progress(self, "until")
+        require(self, "every", self.every >= 1, "1 or more")
 
     def weight(self, progress: float) -> float:
         """Return the factor until the term ends, then 0."""
@@ -41,7 +44,7 @@ class ComparingTerm(Term):
     """A term that is 0 where there is no second time, as in a scene of one moment."""
 
     def __init__(self, schedule: Schedule) -> None:
-        self.schedule = schedule
+        self.schedule, self.every = schedule, schedule.every
 
     def weight(self, progress: float) -> float:
         """Return the factor until the term ends, then 0."""

@@ -39,7 +39,7 @@ class InverseDepth(Term):
     of_canonical: ClassVar[bool] = True
 
     def __init__(self, options: Options) -> None:
-        self.options = options
+        self.options, self.every = options, options.every
 
     def weight(self, progress: float) -> float:
         """Return the factor until the term ends, then 0."""

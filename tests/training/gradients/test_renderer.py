@@ -30,6 +30,24 @@ def trainer(tiny_scene: Path) -> Trainer:
     return trainer_of(tiny_scene, preset_of())
 
 
+def test_a_term_may_count_in_some_steps_and_then_as_many_times(
+    tiny_scene: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    terms = "[{name: inverse_depth, factor: 0.1, every: 3}, {name: isometry, factor: 0.2}]"
+    trainer = trainer_of(tiny_scene, preset_of(f"losses.terms={terms}"))
+    seen, weights = [], TrainingRenderer._weights
+
+    def noted(renderer: TrainingRenderer, phase: Phase) -> list[float]:
+        seen.append(weights(renderer, phase))
+        return seen[-1]
+
+    monkeypatch.setattr(TrainingRenderer, "_weights", noted)
+    for step in range(5):
+        seen.clear()
+        trainer.step()
+        assert seen and all(w == pytest.approx([0 if step % 3 else 0.3, 0.2]) for w in seen), step
+
+
 @pytest.mark.parametrize("progress", [0.0, 0.9])
 def test_training_leaves_out_what_masks_leave_out(
     trainer: Trainer, tmp_path: Path, progress: float

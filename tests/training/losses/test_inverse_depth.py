@@ -103,7 +103,11 @@ def test_nothing_in_view_counts_for_nothing() -> None:
 
 @pytest.mark.parametrize(
     ("options", "problem"),
-    [("factor: 0", "factor is 0"), ("until: 2", "until is 2.0; allowed: a progress from")],
+    [
+        ("factor: 0", "factor is 0"),
+        ("until: 2", "until is 2.0; allowed: a progress from"),
+        ("every: 0", "every is 0; allowed: 1 or more"),
+    ],
 )
 def test_bad_options_are_named(options: str, problem: str) -> None:
     with pytest.raises(UsageError, match=problem):
@@ -111,7 +115,7 @@ def test_bad_options_are_named(options: str, problem: str) -> None:
 
 
 def test_it_trains_with_workers_without_and_resumed(rig: Path, tmp_path: Path) -> None:
-    term = "losses.terms=[{name: inverse_depth, factor: 0.1, until: 0.8}]"
+    term = "losses.terms=[{name: inverse_depth, factor: 0.1, until: 0.8, every: 3}]"
     trainer = assert_trains_the_same_in_all_ways(rig, tmp_path, term, "density.prune_scale=10.0")
     (only,) = trainer.renderer.terms
     assert [only.weight(progress) for progress in (0.0, 0.79, 0.8)] == [0.1, 0.1, 0.0]
