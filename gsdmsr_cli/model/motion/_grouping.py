@@ -119,12 +119,16 @@ def settle(
     Each goes to the mean of where these movements take it from (generalised Procrustes analysis,
     Gower 1975): so what is not rigid is a little wrong at all times, rather than right at the time
     of ``before`` and the more wrong the further away from it. Sizes are the means of those times.
+    Means of places far from the origin would round in float32, so it is done in float64.
 
     Args:
         before: N splats.
         then: they at the times.
         group, weights, anchors: see ``fit_movements``.
     """
+    dtype = before.means.dtype
+    before, *then = (one.map(Tensor.double) for one in (before, *then))
+    weights, anchors = weights.double(), anchors.double()
     for _ in range(ROUNDS):
         total = torch.zeros_like(before.means)
         for after in then:
@@ -132,7 +136,7 @@ def settle(
             total += take_back(after.means, movements, group, anchors)
         before = replace(before, means=total / len(then))
     scales = torch.stack([after.log_scales.exp() for after in then]).mean(dim=0)
-    return replace(before, log_scales=scales.log())
+    return replace(before, log_scales=scales.log()).map(lambda tensor: tensor.to(dtype))
 
 
 def take_back(means: Tensor, movements: Tensor, group: Tensor, anchors: Tensor) -> Tensor:
