@@ -15,6 +15,11 @@ def turned(added: Tensor) -> Tensor:
     return normalize(added + added.new_tensor([1.0, 0.0, 0.0, 0.0]), dim=1)
 
 
+def added_to_none(quats: Tensor) -> Tensor:
+    """Return what unit quaternions (N, 4) add to that of no rotation (N, 4), see ``turned``."""
+    return quats - quats.new_tensor([1.0, 0.0, 0.0, 0.0])
+
+
 def slerp(first: Tensor, second: Tensor, u: float) -> Tensor:
     """Return the rotations (N, 4) at u in [0, 1] on the shorter arcs between two.
 

@@ -15,7 +15,7 @@ from gsdmsr_cli.gaussians.moment import Moment
 from gsdmsr_cli.gaussians.splats import Splats
 from gsdmsr_cli.ground.geometry import quat_product
 from gsdmsr_cli.model.layer import Facts, Instant, Layer
-from gsdmsr_cli.model.motion._arcs import slerp, turned
+from gsdmsr_cli.model.motion._arcs import added_to_none, slerp, turned
 from gsdmsr_cli.model.parameter import Parameter, Rate
 
 _PAST = "past_offsets", "past_turns"
@@ -156,7 +156,7 @@ class Streamed(Layer):
             splats: those that move, as they are at the first moment.
             first: whether that is the one that ends; from then on there are always the same splats.
         """
-        self.turns.copy_(turned(self.turns) - self.turns.new_tensor([1.0, 0.0, 0.0, 0.0]))
+        self.turns.copy_(added_to_none(turned(self.turns)))
 
     @torch.no_grad()
     def mend(self) -> Mapping[str, Tensor]:

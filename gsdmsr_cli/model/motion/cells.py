@@ -17,7 +17,7 @@ from torch import Tensor
 from gsdmsr_cli.gaussians.splats import Splats
 from gsdmsr_cli.ground.geometry import quat_to_rotmat
 from gsdmsr_cli.model.layer import Facts
-from gsdmsr_cli.model.motion._arcs import turned
+from gsdmsr_cli.model.motion._arcs import added_to_none, turned
 from gsdmsr_cli.model.motion._halving import cells_of
 from gsdmsr_cli.model.motion._streamed import Knot, Streamed
 from gsdmsr_cli.model.parameter import Parameter
@@ -88,8 +88,7 @@ class Cells(Streamed):
         quats = turned(rows.turns)
         axes = quat_to_rotmat(quats) - torch.eye(3, device=quats.device)
         shifts = rows.offsets - (axes @ self.middles[:, :, None])[:, :, 0]
-        turns = quats - quats.new_tensor([1.0, 0.0, 0.0, 0.0])
-        return torch.cat([axes.flatten(1), shifts, turns], dim=1)
+        return torch.cat([axes.flatten(1), shifts, added_to_none(quats)], dim=1)
 
     def _with_larger(self, own: Tensor) -> Tensor:
         """Return the sums (C, K) over each cell and all larger ones that it is in, of (C, K)."""

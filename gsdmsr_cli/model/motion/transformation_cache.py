@@ -17,10 +17,11 @@ from gsdmsr_cli.gaussians.splats import Splats
 from gsdmsr_cli.ground.geometry import quat_product
 from gsdmsr_cli.model.layer import Facts
 from gsdmsr_cli.model.limits import require_hash_levels, require_hash_sizes, require_multiples
-from gsdmsr_cli.model.motion._arcs import turned
+from gsdmsr_cli.model.motion._arcs import added_to_none, turned
 from gsdmsr_cli.model.motion._streamed import Knot, Streamed
 from gsdmsr_cli.model.parameter import Parameter, name_parameters
 from gsdmsr_cli.ops import hash_grid, network, planes
+from gsdmsr_cli.ops.finite import all_finite
 from gsdmsr_cli.options.strict import require_rates
 
 STREAMED = True
@@ -94,7 +95,7 @@ class TransformationCache(Streamed):
         features = hash_grid.lookup(self.levels, self.table, places)
         added = network.apply_network(self.network, features)
         turns = quat_product(turned(added[:, 3:]), turned(rows.turns))
-        return Knot(rows.offsets + added[:, :3], turns - turns.new_tensor([1.0, 0.0, 0.0, 0.0]))
+        return Knot(rows.offsets + added[:, :3], added_to_none(turns))
 
     @torch.no_grad()
     def go_on(self, first: float, last: float, time: float, share: float) -> None:
@@ -115,14 +116,14 @@ class TransformationCache(Streamed):
     @torch.no_grad()
     def mend(self) -> Mapping[str, Tensor]:
         """Let what is not finite of grid and network be 0."""
-        found = {}
-        for name in self.learnt:
-            own = self.tensors()[name]
-            lost = ~own.isfinite()
-            if lost.any():
-                own[lost] = 0
-                found[name] = lost
-        return found
+        tensors = self.tensors()
+        learnt = {name: tensors[name] for name in self.learnt}
+        if all_finite(list(learnt.values())):  # asked in every step
+            return {}
+        lost = {name: ~own.isfinite() for name, own in learnt.items()}
+        for name, own in learnt.items():
+            own[lost[name]] = 0
+        return {name: rows for name, rows in lost.items() if rows.any()}
 
     def restore(self, tensors: Mapping[str, Tensor], count: int) -> None:
         """See ``Layer.restore``; moments' files have neither grid nor network, and need none."""

@@ -113,13 +113,12 @@ def draw_and_compare(
     tile_weights: Tensor | None = None,
     counted: Tensor | None = None,
     normal: float = 1.0,
-    with_depth: bool = False,
 ) -> tuple[Judged, Frame]:
     """Draw a moment, let the model shade the frame, compare; return the frame as well.
 
-    Arguments as in ``compare``; ``with_depth`` as in ``Engine.rasterize``.
+    Arguments as in ``compare``.
     """
-    frame = engine.rasterize(moment, camera, background, sh_degree, with_depth)
+    frame = engine.rasterize(moment, camera, background, sh_degree)
     frame = model.shade(frame, instant)
     return judge(frame, target, ssim_weight, tile_weights, counted, normal), frame
 

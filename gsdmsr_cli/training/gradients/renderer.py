@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
+from functools import partial
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -12,7 +14,7 @@ from torch import Tensor
 from gsdmsr_cli.gaussians.moment import Moment
 from gsdmsr_cli.ground.splatting_constants import tile_grid
 from gsdmsr_cli.model.layer import Instant
-from gsdmsr_cli.model.model import STORED_AS, Model
+from gsdmsr_cli.model.model import Model
 from gsdmsr_cli.options.preset import BACKGROUNDS, Preset
 from gsdmsr_cli.raster import ComparingViews, Engine
 from gsdmsr_cli.scene.camera import Camera
@@ -23,10 +25,27 @@ from gsdmsr_cli.training.gradients.compare import (
     compare_views,
     differentiate,
     draw_and_compare,
-    sum_of,
 )
+from gsdmsr_cli.training.gradients.depth_terms import add_depth_terms
 from gsdmsr_cli.training.gradients.phase import Order, Phase, ViewGradients
 from gsdmsr_cli.training.losses import Seen, start_term
+
+
+class _Look(NamedTuple):
+    """A view as it is drawn and compared."""
+
+    order: Order
+    view: View
+    pictures: Pictures | HalvedPictures
+    instant: Instant
+    camera: Camera
+    target: Tensor
+
+    def seen(self, model: Model) -> dict[str, Any]:
+        """Return what terms of the loss are given of it, but for what was drawn."""
+        order, view, pictures, instant, _, target = self
+        given = {"view": view, "pictures": pictures, "target": target}
+        return given | {"instant": instant, "seed": order.seed, "place": model.placed}
 
 
 class TrainingRenderer:
@@ -81,40 +100,63 @@ class TrainingRenderer:
         Raises:
             DataError: a view's picture cannot be read.
         """
-        if any(weight > 0 for weight in self._weights(phase)) or model.shades:
-            return [self._with_terms(model, order, phase) for order in orders]
-        pictures, views = self._pictures(phase.progress), [self.views[o.row] for o in orders]
-        seen = [
-            model.instant_of_view(view.time, pictures.camera(view), order.jitter)
-            for view, order in zip(views, orders, strict=True)
-        ]
-        instants, cameras = [one for one, _ in seen], [camera for _, camera in seen]
-        targets = [self._resident.load(pictures, view) for view in views]
-        masks = [pictures.signal(view, MASK) for view in views]
-        weights = [self._on_device(order.tile_weights) for order in orders]
+        looks = [self._look(model, order, phase) for order in orders]
+        weighted = list(zip(self.terms, self._weights(phase), strict=True))
+        if model.shades or any(not term.of_depth and weight > 0 for term, weight in weighted):
+            found = [self._with_terms(model, look, phase) for look in looks]
+        else:
+            found = self._compared(model, looks, phase)
+        of_depth = [(term, weight) for term, weight in weighted if term.of_depth and weight > 0]
+        if not of_depth:
+            return [of_picture for of_picture, _ in found]
+        return [
+            add_depth_terms(
+                of_picture, of_depth, partial(Seen, **look.seen(model)), moment, look.camera, model,
+                self.engine,
+            )
+            for (of_picture, moment), look in zip(found, looks, strict=True)
+        ]  # fmt: skip
+
+    def _look(self, model: Model, order: Order, phase: Phase) -> _Look:
+        pictures, view = self._pictures(phase.progress), self.views[order.row]
+        recorded = pictures.camera(view)
+        instant, camera = model.instant_of_view(view.time, recorded, order.jitter)
+        return _Look(order, view, pictures, instant, camera, self._resident.load(pictures, view))
+
+    def _compared(
+        self, model: Model, looks: Sequence[_Look], phase: Phase
+    ) -> list[tuple[ViewGradients, Moment]]:
+        """Draw and compare views, at once if the engine can; return the moments drawn as well."""
+        cameras, targets = [look.camera for look in looks], [look.target for look in looks]
+        masks = [look.pictures.signal(look.view, MASK) for look in looks]
+        weights = [self._on_device(look.order.tile_weights) for look in looks]
         further = self._ssim_weight(phase.progress), self._sh_degree(phase.progress)
         normal = self.preset.losses.inliers
         whole = normal == 1 and all(mask is None for mask in masks)
         together = whole and _alike(cameras, weights)
-        moments: Iterable[Moment] = (self._seen(model, [one], phase)[0] for one in instants)
+        moments: Iterable[Moment] = (self._seen(model, [look.instant], phase)[0] for look in looks)
         if together and isinstance(self.engine, ComparingViews):
-            moments = at_once = self._seen(model, instants, phase)
+            moments = at_once = self._seen(model, [look.instant for look in looks], phase)
             if all(moment.features is None for moment in at_once):
                 given = self.engine, model, at_once, cameras, self.background, targets
-                return compare_views(*given, *further, weights)
+                found = compare_views(*given, *further, weights)
+                return list(zip(found, at_once, strict=True))
         drawn, rest = (self.engine, model), (normal, phase.screens)
         return [
-            compare(*drawn, moment, camera, self.background, target, *further, own, mask, *rest)
+            (
+                compare(
+                    *drawn, moment, camera, self.background, target, *further, own, mask, *rest
+                ),
+                moment,
+            )
             for moment, camera, target, own, mask in zip(
                 moments, cameras, targets, weights, masks, strict=True
             )
         ]
 
-    def _with_terms(self, model: Model, order: Order, phase: Phase) -> ViewGradients:
-        """Draw, shade and compare a view, and add the further terms of the loss."""
-        pictures, view = self._pictures(phase.progress), self.views[order.row]
-        recorded, target = pictures.camera(view), self._resident.load(pictures, view)
-        instant, camera = model.instant_of_view(view.time, recorded, order.jitter)
+    def _with_terms(self, model: Model, look: _Look, phase: Phase) -> tuple[ViewGradients, Moment]:
+        """Draw, shade and compare a view, and add the terms of the loss about its picture."""
+        order, instant, camera = look.order, look.instant, look.camera
         weights = self._weights(phase)
         times = order.other_times or [None] * len(self.terms)
         others = [
@@ -123,45 +165,35 @@ class TrainingRenderer:
         ]
         wanted = [instant, *(other for other in others if other is not None)]
         moments = dict(zip(wanted, self._moved(model, wanted, phase), strict=True))
-        traced = model.trace(moments[instant], instant)  # terms say nothing of where views are from
+        moment = moments[instant]
+        traced = model.trace(moment, instant)  # terms say nothing of where views are from
         judged, frame = draw_and_compare(
-            self.engine, model, traced, instant, camera, self.background, target,
+            self.engine, model, traced, instant, camera, self.background, look.target,
             self._ssim_weight(phase.progress), self._sh_degree(phase.progress),
-            self._on_device(order.tile_weights), pictures.signal(view, MASK),
-            self.preset.losses.inliers, self._need_depth(weights),
+            self._on_device(order.tile_weights), look.pictures.signal(look.view, MASK),
+            self.preset.losses.inliers,
         )  # fmt: skip
-        loss, apart = judged.loss, judged.loss.new_zeros(())
+        loss = judged.loss
         for term, weight, other in zip(self.terms, weights, others, strict=True):
-            if weight > 0:
-                then = None if other is None else moments[other]
-                moment = moments[instant]
+            if weight > 0 and not term.of_depth:
                 seen = Seen(
-                    view, pictures, camera, target, frame, instant, moment, other, then, order.seed,
-                    model.placed,
+                    **look.seen(model), camera=camera, moment=moment, frame=frame,
+                    other_instant=other, other=None if other is None else moments[other],
                 )  # fmt: skip
-                value = weight * term(seen)
-                loss, apart = (loss, apart + value) if term.of_canonical else (loss + value, apart)
-        of_splats = _gradients_of_splats(apart, model)
+                loss = loss + weight * term(seen)
         gradients, on_screen = differentiate(loss, judged, frame, model, phase.screens)
-        gradients = [sum_of(both) for both in zip(gradients, of_splats, strict=True)]
-        loss = loss + apart
         size = camera.width, camera.height
-        return ViewGradients(loss.detach(), gradients, on_screen, size, judged.errors)
+        found = ViewGradients(loss.detach(), gradients, on_screen, size, judged.errors)
+        return found, moment
 
     def _weights(self, phase: Phase) -> list[float]:
         """Return the factor of each term in this step."""
         return [
             0.0
-            if phase.step % term.every or (phase.frozen and term.of_canonical)
+            if phase.step % term.every or (phase.frozen and term.of_depth)
             else term.every * term.weight(phase.progress)
             for term in self.terms
         ]
-
-    def _need_depth(self, weights: Sequence[float]) -> bool:
-        return any(
-            term.needs_depth and weight > 0
-            for term, weight in zip(self.terms, weights, strict=True)
-        )
 
     def other_times(
         self, view: View, times: Sequence[float], generator: torch.Generator
@@ -219,22 +251,6 @@ class TrainingRenderer:
         if options.sh_start <= 0:
             return options.sh_degree
         return min(options.sh_degree, int(progress / options.sh_start))
-
-
-def _gradients_of_splats(loss: Tensor, model: Model) -> list[Tensor | None]:
-    """Return the gradients of a loss () by the stored splats, None for all else that is trained."""
-    trained = model.trained()
-    found: dict[str, Tensor | None] = dict.fromkeys(trained)
-    if loss.requires_grad:
-        own = {name: tensor for name, tensor in trained.items() if name.startswith(STORED_AS)}
-        found |= dict(
-            zip(
-                own,
-                torch.autograd.grad(loss, list(own.values()), retain_graph=True, allow_unused=True),
-                strict=True,
-            )
-        )
-    return list(found.values())
 
 
 def _alike(cameras: Sequence[Camera], tile_weights: Sequence[Tensor | None]) -> bool:

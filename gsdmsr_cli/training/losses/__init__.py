@@ -23,8 +23,9 @@ from gsdmsr_cli.ground import plugins
 from gsdmsr_cli.model.layer import Instant, options_of
 from gsdmsr_cli.raster import Engine
 from gsdmsr_cli.scene.camera import Camera
+from gsdmsr_cli.scene.decoding import DECODERS
 from gsdmsr_cli.scene.pictures import HalvedPictures, Pictures
-from gsdmsr_cli.scene.scene import View
+from gsdmsr_cli.scene.scene import MASK, View
 
 KIND = "term of the loss"
 
@@ -39,10 +40,10 @@ class Seen:
 
     Attributes:
         view: of the scene; ``pictures.signal(view, name)`` reads what it has beside its picture.
-        pictures: of the size that is drawn.
-        camera: of that size.
+        pictures: of the size that the training compares at.
+        camera: of what was drawn, that size unless the term is ``of_depth``.
         target: (3, H, W) uint8 true picture.
-        frame: what was drawn; its depth only if a term ``needs_depth``.
+        frame: what was drawn, without depth; for a term ``of_depth`` see ``draw_depth``.
         instant, moment: when, and what was drawn.
         other_instant, other: the second instant that the term has chosen, and what the model is
             then; None unless it has an ``other_time``.
@@ -66,22 +67,32 @@ class Seen:
         """Return the camera that a view is drawn by, in the size that is drawn."""
         return self.place(self.pictures.camera(view), view.time)
 
+    def counted(self) -> Tensor | None:
+        """Return the pixels (H, W) of what was drawn that the view's mask leaves, None for all."""
+        mask = self.pictures.signal(self.view, MASK)
+        if mask is None:
+            return None
+        height, width = self.frame.alpha.shape
+        if mask.shape != (height, width):
+            mask = DECODERS[MASK].shrink(mask, (width, height))
+        return mask.to(self.frame.alpha.device)
+
 
 class Term(ABC):
     """A scalar that is added to the photometric loss of every view.
 
     Attributes:
-        needs_depth: whether the frame is to have a depth.
         needs_seed: whether it makes random choices, which follow from ``Seen.seed``.
-        of_canonical: whether it is about where the canonical splats are: its gradient reaches them
-            alone, no motion nor further layer, and it has no part once they stay as they are, as
-            after the first moment of a stream.
+        of_depth: whether it is about how far away the canonical splats are: it is given a frame of
+            its own, its gradient reaches them alone, no motion nor further layer, and it has no
+            part once they stay as they are, as after the first moment of a stream.
+        shrink: of a term ``of_depth``, both sides of its frame are divided by this.
         every: in every how many-th step it counts, as many times; in the others it costs nothing.
     """
 
-    needs_depth: ClassVar[bool] = False
     needs_seed: ClassVar[bool] = False
-    of_canonical: ClassVar[bool] = False
+    of_depth: ClassVar[bool] = False
+    shrink: int = 1
     every: int = 1
 
     def weight(self, progress: float) -> float:

@@ -21,7 +21,7 @@ from gsdmsr_cli.raster import Engine
 from gsdmsr_cli.runs.outputs import FLOW
 from gsdmsr_cli.scene.neighbours import LEAST_SHARE, neighbours
 from gsdmsr_cli.scene.pictured_flow import PicturedFlow
-from gsdmsr_cli.scene.scene import MASK, View
+from gsdmsr_cli.scene.scene import View
 from gsdmsr_cli.training.losses import Seen, Term
 
 LEAST_COVER = 0.5
@@ -99,9 +99,9 @@ class Flow(Term):
         moved = screen_motion(seen.moment, seen.camera, seen.other, seen.camera_of(other))
         drawn = blend_motion(moved, seen.moment.detach(), seen.camera, self._engine)
         counts = true.isfinite().all(dim=2) & (seen.frame.alpha.detach() >= LEAST_COVER)
-        mask = seen.pictures.signal(seen.view, MASK)
-        if mask is not None:
-            counts &= mask.to(counts.device)
+        counted = seen.counted()
+        if counted is not None:
+            counts &= counted
         errors = (drawn - true.nan_to_num()).abs().sum(dim=2) * counts
         longer = max(seen.camera.width, seen.camera.height)
         return errors.sum() / (counts.sum().clamp(min=1) * longer)

@@ -14,7 +14,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from gsdmsr_cli.scene.scene import MASK
+from gsdmsr_cli.options.strict import require
 from gsdmsr_cli.training.losses import Seen, Term
 from gsdmsr_cli.training.losses._comparing import Schedule
 
@@ -27,19 +27,28 @@ _NEAREST = 1e-6
 
 @dataclass(frozen=True)
 class Options(Schedule):
-    """See ``Schedule``."""
+    """See ``Schedule``.
+
+    Attributes:
+        shrink: both sides of the picture are divided by this before its depth is drawn: what is to
+            be cleared away is larger than pixels.
+    """
 
     factor: float = 0.03
+    shrink: int = 2
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require(self, "shrink", self.shrink >= 1, "1 or more")
 
 
 class InverseDepth(Term):
     """The logarithm of the mean inverse depth, whose gradient has no unit of length."""
 
-    needs_depth: ClassVar[bool] = True
-    of_canonical: ClassVar[bool] = True
+    of_depth: ClassVar[bool] = True
 
     def __init__(self, options: Options) -> None:
-        self.options, self.every = options, options.every
+        self.options, self.every, self.shrink = options, options.every, options.shrink
 
     def weight(self, progress: float) -> float:
         """Return the factor until the term ends, then 0."""
@@ -50,9 +59,9 @@ class InverseDepth(Term):
         alpha, depth = seen.frame.alpha, seen.frame.depth
         assert depth is not None
         counts = alpha.detach() >= LEAST_COVER
-        mask = seen.pictures.signal(seen.view, MASK)
-        if mask is not None:
-            counts &= mask.to(counts.device)
+        counted = seen.counted()
+        if counted is not None:
+            counts &= counted
         inverse = torch.where(counts, alpha / depth.clamp(min=_NEAREST), 0.0)
         covered = counts.sum()
         mean = inverse.sum() / covered.clamp(min=1)

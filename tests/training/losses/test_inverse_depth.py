@@ -13,6 +13,7 @@ from torch import Tensor
 from training_checks import preset_of
 from view_checks import SIZE, camera_at
 
+from gsdmsr_cli.drawing.depth import draw_depth
 from gsdmsr_cli.gaussians.moment import Moment
 from gsdmsr_cli.gaussians.splats import Splats
 from gsdmsr_cli.ground.errors import UsageError
@@ -49,7 +50,7 @@ def value_of(splats: Splats, mask: Tensor | None = None, distance: float = DISTA
             return mask
 
     moment, pictures = Moment(splats), Known()
-    frame = best_engine("cpu").rasterize(moment, camera, torch.ones(3), with_depth=True)
+    frame = draw_depth(moment, camera, best_engine("cpu"))
     target = torch.zeros(3, SIZE, SIZE, dtype=torch.uint8)
     unread: Any = pictures
     return start_term({"name": "inverse_depth"})(
@@ -70,7 +71,9 @@ def test_it_is_of_the_mean_over_what_is_covered() -> None:
     assert float(value_of(both)) == pytest.approx(math.log((1 / 4 + 1 / 2) / 2), abs=2e-2)
     half = torch.zeros(SIZE, SIZE, dtype=torch.bool)
     half[:, : SIZE // 2] = True
-    assert float(value_of(both, half)) == pytest.approx(math.log(1 / 4), abs=1e-4)
+    larger = half.repeat_interleave(3, 0).repeat_interleave(3, 1)  # of a picture that was shrunk
+    for mask in (half, larger):
+        assert float(value_of(both, mask)) == pytest.approx(math.log(1 / 4), abs=1e-4)
 
 
 @pytest.mark.parametrize("unit", [1.0, 10.0])
@@ -107,6 +110,7 @@ def test_nothing_in_view_counts_for_nothing() -> None:
         ("factor: 0", "factor is 0"),
         ("until: 2", "until is 2.0; allowed: a progress from"),
         ("every: 0", "every is 0; allowed: 1 or more"),
+        ("shrink: 0", "shrink is 0; allowed: 1 or more"),
     ],
 )
 def test_bad_options_are_named(options: str, problem: str) -> None:

@@ -1,0 +1,35 @@
+"""Draws how far away what a pixel shows is, without its colours."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+
+from gsdmsr_cli.gaussians.frame import Frame
+from gsdmsr_cli.gaussians.moment import Moment
+from gsdmsr_cli.ground.geometry import SH_C0
+from gsdmsr_cli.raster import Engine
+from gsdmsr_cli.scene.camera import Camera
+
+
+def draw_depth(moment: Moment, camera: Camera, engine: Engine) -> Frame:
+    """Return a frame whose alpha and depth are those of the moment.
+
+    Depth is blended as if it were the splats' colour, once for the colours that the frame then
+    lacks: with ``with_depth`` engines blend both. The frame's rgb is its depth, and its depth is
+    what ``Frame`` says, differentiable by the moment.
+
+    Args:
+        moment: N splats.
+        camera: gives the picture's size.
+        engine: see ``gsdmsr_cli.raster``.
+    """
+    means = moment.splats.means
+    axis, ahead = camera.rotation[2].copy(), float(camera.translation[2])
+    depths = means @ torch.from_numpy(axis).to(means) + ahead
+    # colours are harmonics plus 0.5; what lies behind the camera, below 0, is not drawn
+    as_colour = ((depths - 0.5) / SH_C0)[:, None, None].expand(-1, 1, 3)
+    coloured = replace(moment.splats, sh=as_colour)
+    frame = engine.rasterize(Moment(coloured, moment.axes), camera, means.new_zeros(3))
+    return replace(frame, depth=frame.rgb[..., 0])
