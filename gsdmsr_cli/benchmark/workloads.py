@@ -78,8 +78,9 @@ def training_step(size: int, count: int, motion: str, device: str = "cpu") -> Ca
     optimizer, rates = Adam(), dict.fromkeys(model.tensors(), 0.0)
 
     def run() -> None:
-        moment = model.at(model.instant(TIME, view))
-        found = compare(engine, model, moment, view, background, target, SSIM_WEIGHT)
+        instant = model.instant(TIME, view)
+        moment = model.at(instant)
+        found = compare(engine, model, moment, instant, view, background, target, SSIM_WEIGHT)
         for tensor, gradient in zip(model.trained().values(), found.gradients, strict=True):
             tensor.grad = gradient
         optimizer.step(model.trained(), rates)

@@ -30,7 +30,8 @@ def draw_flow(
         next_camera: of the next moment, whose pictures have the same size.
         engine: draws the displacements as if they were colours.
     """
-    return blend_motion(screen_motion(moment, camera, later, next_camera), moment, camera, engine)
+    moved = screen_motion(moment, camera, later, next_camera)
+    return blend_motion(moved, moment, camera, engine)[0]
 
 
 def screen_motion(moment: Moment, camera: Camera, later: Moment, next_camera: Camera) -> Tensor:
@@ -43,8 +44,13 @@ def screen_motion(moment: Moment, camera: Camera, later: Moment, next_camera: Ca
     return torch.nan_to_num(moved).clamp(-most, most)
 
 
-def blend_motion(moved: Tensor, moment: Moment, camera: Camera, engine: Engine) -> Tensor:
-    """Return the expected (H, W, 2) displacement where splats have displacements (N, 2) [px]."""
+def blend_motion(
+    moved: Tensor, moment: Moment, camera: Camera, engine: Engine
+) -> tuple[Tensor, Tensor]:
+    """Return the expected (H, W, 2) displacement where splats have displacements (N, 2) [px].
+
+    And alpha (H, W), where they are drawn at all.
+    """
     scale = max(float(moved.detach().abs().max()) if len(moved) else 0.0, 1e-6)
     # engines clamp colours at 0, so displacements go to [0, 1] and back: with weights w that sum
     # to alpha, sum w (d / s + 1) / 2 = (sum w d / s + alpha) / 2
@@ -54,7 +60,8 @@ def blend_motion(moved: Tensor, moment: Moment, camera: Camera, engine: Engine) 
     frame = engine.rasterize(Moment(coloured, moment.axes), camera, moved.new_zeros(3))
     alpha = frame.alpha[..., None]
     blended = scale * (2 * frame.rgb[..., :2] - alpha)
-    return torch.where(alpha > ALPHA_MIN, blended / alpha.clamp(min=ALPHA_MIN), 0.0)
+    mean = torch.where(alpha > ALPHA_MIN, blended / alpha.clamp(min=ALPHA_MIN), 0.0)
+    return mean, frame.alpha
 
 
 def project(means: Tensor, camera: Camera) -> Tensor:

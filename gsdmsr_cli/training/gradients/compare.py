@@ -37,6 +37,7 @@ def compare(
     engine: Engine,
     model: Model,
     moment: Moment,
+    instant: Instant,
     camera: Camera,
     background: Tensor,
     target: Tensor,
@@ -46,13 +47,17 @@ def compare(
     counted: Tensor | None = None,
     normal: float = 1.0,
     screens: bool = True,
+    further: Tensor | None = None,
 ) -> ViewGradients:
-    """Draw what a model is at a moment and compare the picture with a target.
+    """Draw what a model is at a moment, let it shade the frame, and compare that with a target.
+
+    In one fused call, if the engine can and all that is compared is what it draws.
 
     Args:
         engine: what draws.
         model: whose trained tensors the gradients are taken by.
-        moment: the model's, at the time of the target or unmoved.
+        moment: the model's, at the instant of the target or unmoved.
+        instant: of the target.
         camera, background, sh_degree: see ``Engine.rasterize``.
         target, ssim_weight: see ``photometric_loss``.
         tile_weights: (tiles,) factors on the share of each tile in the loss, or None for 1
@@ -60,18 +65,19 @@ def compare(
         counted: (H, W) bool, pixels that have a part in the loss, or None for all.
         normal: share of the pixels whose errors are taken to be normal, see ``inliers``.
         screens: whether the gradients on the screen are wanted.
+        further: what is added to the loss, (), differentiable by the moment; or None.
     """
-    given = moment, camera, background, target, ssim_weight, sh_degree, tile_weights
-    whole = counted is None and normal == 1
-    size = camera.width, camera.height
-    if whole and moment.features is None and isinstance(engine, Comparing):
-        found = engine.compare(*given)
-        gradients = gradients_of(found.loss, model)
-        return ViewGradients(found.loss.detach(), gradients, found.on_screen, size, found.errors)
-    frame = engine.rasterize(moment, camera, background, sh_degree)
+    whole = counted is None and normal == 1 and moment.features is None and not model.shades
+    if whole and isinstance(engine, Comparing):
+        found = engine.compare(
+            moment, camera, background, target, ssim_weight, sh_degree, tile_weights
+        )
+        loss = found.loss if further is None else found.loss + further
+        size, gradients = (camera.width, camera.height), gradients_of(loss, model)
+        return ViewGradients(loss.detach(), gradients, found.on_screen, size, found.errors)
+    frame = model.shade(engine.rasterize(moment, camera, background, sh_degree), instant)
     judged = judge(frame, target, ssim_weight, tile_weights, counted, normal)
-    gradients, on_screen = differentiate(judged.loss, judged, frame, model, screens)
-    return ViewGradients(judged.loss.detach(), gradients, on_screen, size, judged.errors)
+    return differentiate(judged, frame, model, screens, further)
 
 
 def compare_views(
@@ -84,43 +90,23 @@ def compare_views(
     ssim_weight: float,
     sh_degree: int | None,
     tile_weights: Sequence[Tensor | None],
+    further: Sequence[Tensor | None],
 ) -> list[ViewGradients]:
     """Do what ``compare`` does of several views at once."""
     weights = [own for own in tile_weights if own is not None]
     loss, found = engine.compare_views(
         moments, cameras, background, targets, ssim_weight, sh_degree, weights or None
     )
-    gradients = gradients_of(loss, model)
+    more = sum_of(further)
+    gradients = gradients_of(loss if more is None else loss + more, model)
     nothing = [None] * len(gradients)
     return [
         ViewGradients(
-            own.loss, nothing if i else gradients, own.on_screen, (c.width, c.height), own.errors
+            own.loss if extra is None else own.loss + extra.detach(),
+            nothing if i else gradients, own.on_screen, (c.width, c.height), own.errors,
         )
-        for i, (own, c) in enumerate(zip(found, cameras, strict=True))
-    ]
-
-
-def draw_and_compare(
-    engine: Engine,
-    model: Model,
-    moment: Moment,
-    instant: Instant,
-    camera: Camera,
-    background: Tensor,
-    target: Tensor,
-    ssim_weight: float,
-    sh_degree: int | None = None,
-    tile_weights: Tensor | None = None,
-    counted: Tensor | None = None,
-    normal: float = 1.0,
-) -> tuple[Judged, Frame]:
-    """Draw a moment, let the model shade the frame, compare; return the frame as well.
-
-    Arguments as in ``compare``.
-    """
-    frame = engine.rasterize(moment, camera, background, sh_degree)
-    frame = model.shade(frame, instant)
-    return judge(frame, target, ssim_weight, tile_weights, counted, normal), frame
+        for i, (own, extra, c) in enumerate(zip(found, further, cameras, strict=True))
+    ]  # fmt: skip
 
 
 class Judged(NamedTuple):
@@ -139,28 +125,34 @@ class Judged(NamedTuple):
 
 
 def differentiate(
-    loss: Tensor, judged: Judged, frame: Frame, model: Model, screens: bool = True
-) -> tuple[Sequence[Tensor | None], Tensor]:
-    """Return the gradients of a loss by all trained tensors, and of the unweighted by the screen.
+    judged: Judged,
+    frame: Frame,
+    model: Model,
+    screens: bool = True,
+    further: Tensor | None = None,
+) -> ViewGradients:
+    """Return what a frame that has been judged says of a model.
 
     Args:
-        loss: of the frame, and of further terms.
-        judged: of the frame alone.
+        judged: of the frame.
         frame: what was judged.
         model: whose it is.
         screens: whether the gradients on the screen are wanted.
-
-    Returns:
-        the gradients, and (N, 2) those by the positions on the screen [1 / px], or 0.
+        further: see ``compare``.
     """
-    if loss is judged.unweighted:  # going back through the picture is what takes long: once will do
-        wanted = [*model.trained().values(), frame.means2d]
+    loss = judged.loss if further is None else judged.loss + further
+    trained = list(model.trained().values())
+    if judged.loss is judged.unweighted:
+        # going back through the picture is what takes long: once will do
+        wanted = [*trained, frame.means2d]
         *gradients, on_screen = torch.autograd.grad(loss, wanted, allow_unused=True)
-        return gradients, on_screen
-    if not screens:
-        return gradients_of(loss, model), torch.zeros_like(frame.means2d)
-    (on_screen,) = torch.autograd.grad(judged.unweighted, frame.means2d, retain_graph=True)
-    return gradients_of(loss, model), on_screen
+    else:
+        on_screen = torch.zeros_like(frame.means2d)
+        if screens:
+            (on_screen,) = torch.autograd.grad(judged.unweighted, frame.means2d, retain_graph=True)
+        gradients = [*torch.autograd.grad(loss, trained, allow_unused=True)]
+    height, width = frame.alpha.shape
+    return ViewGradients(loss.detach(), gradients, on_screen, (width, height), judged.errors)
 
 
 def judge(

@@ -8,6 +8,7 @@ from dataclasses import replace
 import torch
 
 from gsdmsr_cli.drawing.depth import draw_depth
+from gsdmsr_cli.gaussians.frame import Frame
 from gsdmsr_cli.gaussians.moment import Moment
 from gsdmsr_cli.model.folding import mask_gradients
 from gsdmsr_cli.model.model import Model
@@ -21,7 +22,7 @@ from gsdmsr_cli.training.losses import Seen, Term
 def add_depth_terms(
     found: ViewGradients,
     terms: Iterable[tuple[Term, float]],
-    seen: Callable[..., Seen],
+    seen: Callable[[Moment, Camera, Frame], Seen],
     moment: Moment,
     camera: Camera,
     model: Model,
@@ -35,7 +36,7 @@ def add_depth_terms(
     Args:
         found: of the picture.
         terms: ``of_depth``, and the factor of each.
-        seen: makes what terms are given, of a moment, a camera and a frame.
+        seen: makes what terms are given.
         moment: that was drawn; its graph is not needed.
         camera: that the picture was drawn by.
         model: whose stored splats get the gradients.
@@ -48,7 +49,7 @@ def add_depth_terms(
         width, height = (max(1, side // term.shrink) for side in found.size)
         smaller = camera.resized(width, height)
         frame = draw_depth(moment, smaller, engine)
-        loss = loss + weight * term(seen(moment=moment, camera=smaller, frame=frame))
+        loss = loss + weight * term(seen(moment, smaller, frame))
     parts = zip(found.gradients, gradients_of(loss, model), strict=True)
     gradients = [sum_of(both) for both in parts]
     return replace(found, loss=found.loss + loss.detach(), gradients=gradients)

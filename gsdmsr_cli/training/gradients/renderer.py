@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
+from gsdmsr_cli.gaussians.frame import Frame
 from gsdmsr_cli.gaussians.moment import Moment
 from gsdmsr_cli.ground.splatting_constants import tile_grid
 from gsdmsr_cli.model.layer import Instant
@@ -20,19 +22,18 @@ from gsdmsr_cli.raster import ComparingViews, Engine
 from gsdmsr_cli.scene.camera import Camera
 from gsdmsr_cli.scene.pictures import HalvedPictures, Pictures, ResidentPictures
 from gsdmsr_cli.scene.scene import MASK, View
-from gsdmsr_cli.training.gradients.compare import (
-    compare,
-    compare_views,
-    differentiate,
-    draw_and_compare,
-)
+from gsdmsr_cli.training.gradients.compare import compare, compare_views, sum_of
 from gsdmsr_cli.training.gradients.depth_terms import add_depth_terms
 from gsdmsr_cli.training.gradients.phase import Order, Phase, ViewGradients
 from gsdmsr_cli.training.losses import Seen, start_term
 
 
 class _Look(NamedTuple):
-    """A view as it is drawn and compared."""
+    """A view as it is drawn and compared.
+
+    Attributes:
+        others: second instants, of each term of the loss; None where it has none.
+    """
 
     order: Order
     view: View
@@ -40,12 +41,22 @@ class _Look(NamedTuple):
     instant: Instant
     camera: Camera
     target: Tensor
+    mask: Tensor | None
+    others: tuple[Instant | None, ...]
 
-    def seen(self, model: Model) -> dict[str, Any]:
-        """Return what terms of the loss are given of it, but for what was drawn."""
-        order, view, pictures, instant, _, target = self
-        given = {"view": view, "pictures": pictures, "target": target}
-        return given | {"instant": instant, "seed": order.seed, "place": model.placed}
+    @property
+    def instants(self) -> list[Instant]:
+        """Return all at which the model is wanted."""
+        return [self.instant, *(other for other in self.others if other is not None)]
+
+    def seen(
+        self, model: Model, moment: Moment, camera: Camera, frame: Frame | None = None
+    ) -> Seen:
+        """Return what a term is given that has no second instant."""
+        return Seen(
+            self.view, self.pictures, camera, self.target, self.instant, moment, frame=frame,
+            seed=self.order.seed, place=model.placed,
+        )  # fmt: skip
 
 
 class TrainingRenderer:
@@ -79,9 +90,10 @@ class TrainingRenderer:
             term.cache_in(folder)
 
     def renders_at_once(self, model: Model) -> bool:
-        """Return whether the views of a step are rendered at once in all phases of the training.
+        """Return whether further views of a step cost little, in all phases of the training.
 
-        If their pictures are of one size, and the engine can.
+        They do if the engine renders views at once, which it does if their pictures are of one
+        size. Terms of the loss are asked of one view after the other.
         """
         losses = self.preset.losses
         whole = not any(MASK in view.signals for view in self.views)
@@ -101,90 +113,78 @@ class TrainingRenderer:
             DataError: a view's picture cannot be read.
         """
         looks = [self._look(model, order, phase) for order in orders]
-        weighted = list(zip(self.terms, self._weights(phase), strict=True))
-        if model.shades or any(not term.of_depth and weight > 0 for term, weight in weighted):
-            found = [self._with_terms(model, look, phase) for look in looks]
-        else:
-            found = self._compared(model, looks, phase)
-        of_depth = [(term, weight) for term, weight in weighted if term.of_depth and weight > 0]
-        if not of_depth:
-            return [of_picture for of_picture, _ in found]
-        return [
-            add_depth_terms(
-                of_picture, of_depth, partial(Seen, **look.seen(model)), moment, look.camera, model,
-                self.engine,
-            )
-            for (of_picture, moment), look in zip(found, looks, strict=True)
-        ]  # fmt: skip
+        if self._can_be_at_once(model, looks):
+            return self._at_once(model, looks, phase)
+        return [self._alone(model, look, phase) for look in looks]
 
     def _look(self, model: Model, order: Order, phase: Phase) -> _Look:
         pictures, view = self._pictures(phase.progress), self.views[order.row]
-        recorded = pictures.camera(view)
+        recorded, weights = pictures.camera(view), self._weights(phase)
         instant, camera = model.instant_of_view(view.time, recorded, order.jitter)
-        return _Look(order, view, pictures, instant, camera, self._resident.load(pictures, view))
-
-    def _compared(
-        self, model: Model, looks: Sequence[_Look], phase: Phase
-    ) -> list[tuple[ViewGradients, Moment]]:
-        """Draw and compare views, at once if the engine can; return the moments drawn as well."""
-        cameras, targets = [look.camera for look in looks], [look.target for look in looks]
-        masks = [look.pictures.signal(look.view, MASK) for look in looks]
-        weights = [self._on_device(look.order.tile_weights) for look in looks]
-        further = self._ssim_weight(phase.progress), self._sh_degree(phase.progress)
-        normal = self.preset.losses.inliers
-        whole = normal == 1 and all(mask is None for mask in masks)
-        together = whole and _alike(cameras, weights)
-        moments: Iterable[Moment] = (self._seen(model, [look.instant], phase)[0] for look in looks)
-        if together and isinstance(self.engine, ComparingViews):
-            moments = at_once = self._seen(model, [look.instant for look in looks], phase)
-            if all(moment.features is None for moment in at_once):
-                given = self.engine, model, at_once, cameras, self.background, targets
-                found = compare_views(*given, *further, weights)
-                return list(zip(found, at_once, strict=True))
-        drawn, rest = (self.engine, model), (normal, phase.screens)
-        return [
-            (
-                compare(
-                    *drawn, moment, camera, self.background, target, *further, own, mask, *rest
-                ),
-                moment,
-            )
-            for moment, camera, target, own, mask in zip(
-                moments, cameras, targets, weights, masks, strict=True
-            )
-        ]
-
-    def _with_terms(self, model: Model, look: _Look, phase: Phase) -> tuple[ViewGradients, Moment]:
-        """Draw, shade and compare a view, and add the terms of the loss about its picture."""
-        order, instant, camera = look.order, look.instant, look.camera
-        weights = self._weights(phase)
         times = order.other_times or [None] * len(self.terms)
-        others = [
+        others = tuple(
             None if time is None or not weight > 0 else model.instant(time, camera, order.jitter)
             for time, weight in zip(times, weights, strict=True)
-        ]
-        wanted = [instant, *(other for other in others if other is not None)]
-        moments = dict(zip(wanted, self._moved(model, wanted, phase), strict=True))
-        moment = moments[instant]
-        traced = model.trace(moment, instant)  # terms say nothing of where views are from
-        judged, frame = draw_and_compare(
-            self.engine, model, traced, instant, camera, self.background, look.target,
+        )
+        target, mask = self._resident.load(pictures, view), pictures.signal(view, MASK)
+        return _Look(order, view, pictures, instant, camera, target, mask, others)
+
+    def _can_be_at_once(self, model: Model, looks: Sequence[_Look]) -> bool:
+        able = isinstance(self.engine, ComparingViews) and not model.shades
+        whole = self.preset.losses.inliers == 1 and all(look.mask is None for look in looks)
+        return able and whole and _alike(looks)
+
+    def _at_once(self, model: Model, looks: Sequence[_Look], phase: Phase) -> list[ViewGradients]:
+        assert isinstance(self.engine, ComparingViews)
+        moments = self._moved(model, [i for look in looks for i in look.instants], phase)
+        found = compare_views(
+            self.engine, model,
+            [model.trace(moments[look.instant], look.instant) for look in looks],
+            [look.camera for look in looks], self.background, [look.target for look in looks],
             self._ssim_weight(phase.progress), self._sh_degree(phase.progress),
-            self._on_device(order.tile_weights), look.pictures.signal(look.view, MASK),
-            self.preset.losses.inliers,
+            [self._on_device(look.order.tile_weights) for look in looks],
+            [self._further(model, look, moments, phase) for look in looks],
         )  # fmt: skip
-        loss = judged.loss
-        for term, weight, other in zip(self.terms, weights, others, strict=True):
+        return [
+            self._with_depth_terms(own, model, look, moments[look.instant], phase)
+            for own, look in zip(found, looks, strict=True)
+        ]
+
+    def _alone(self, model: Model, look: _Look, phase: Phase) -> ViewGradients:
+        moments = self._moved(model, look.instants, phase)
+        moment = moments[look.instant]
+        found = compare(
+            self.engine, model, model.trace(moment, look.instant), look.instant, look.camera,
+            self.background, look.target, self._ssim_weight(phase.progress),
+            self._sh_degree(phase.progress), self._on_device(look.order.tile_weights), look.mask,
+            self.preset.losses.inliers, phase.screens, self._further(model, look, moments, phase),
+        )  # fmt: skip
+        return self._with_depth_terms(found, model, look, moment, phase)
+
+    def _further(
+        self, model: Model, look: _Look, moments: Mapping[Instant, Moment], phase: Phase
+    ) -> Tensor | None:
+        """Return the sum of the terms but for those about depth, or None if none counts.
+
+        They say nothing of where views are from, so their moments are not traced.
+        """
+        values = []
+        for term, weight, other in zip(self.terms, self._weights(phase), look.others, strict=True):
             if weight > 0 and not term.of_depth:
-                seen = Seen(
-                    **look.seen(model), camera=camera, moment=moment, frame=frame,
-                    other_instant=other, other=None if other is None else moments[other],
-                )  # fmt: skip
-                loss = loss + weight * term(seen)
-        gradients, on_screen = differentiate(loss, judged, frame, model, phase.screens)
-        size = camera.width, camera.height
-        found = ViewGradients(loss.detach(), gradients, on_screen, size, judged.errors)
-        return found, moment
+                then = None if other is None else moments[other]
+                seen = look.seen(model, moments[look.instant], look.camera)
+                values.append(weight * term(replace(seen, other_instant=other, other=then)))
+        return sum_of(values)
+
+    def _with_depth_terms(
+        self, found: ViewGradients, model: Model, look: _Look, moment: Moment, phase: Phase
+    ) -> ViewGradients:
+        weighted = zip(self.terms, self._weights(phase), strict=True)
+        counting = [(term, weight) for term, weight in weighted if term.of_depth and weight > 0]
+        if not counting:
+            return found
+        seen = partial(look.seen, model)
+        return add_depth_terms(found, counting, seen, moment, look.camera, model, self.engine)
 
     def _weights(self, phase: Phase) -> list[float]:
         """Return the factor of each term in this step."""
@@ -207,19 +207,15 @@ class TrainingRenderer:
             return 0
         return int(torch.randint(2**62, (), generator=generator))
 
-    def _seen(self, model: Model, instants: Sequence[Instant], phase: Phase) -> list[Moment]:
-        """Return the model at each of the instants, as it is drawn."""
-        moved = self._moved(model, instants, phase)
-        return [model.trace(moment, now) for moment, now in zip(moved, instants, strict=True)]
-
-    def _moved(self, model: Model, instants: Sequence[Instant], phase: Phase) -> list[Moment]:
-        """Return the model at each of the instants, the very same where these are equal."""
-        if not phase.moving:
-            return [Moment(model.splats)] * len(instants)
+    def _moved(
+        self, model: Model, instants: Sequence[Instant], phase: Phase
+    ) -> dict[Instant, Moment]:
+        """Return the model at each of the instants."""
         distinct = list(dict.fromkeys(instants))
+        if not phase.moving:
+            return dict.fromkeys(distinct, Moment(model.splats))
         moved = model.at_instants(distinct, phase.gradient_mask)
-        by_instant = dict(zip(distinct, moved, strict=True))
-        return [by_instant[instant] for instant in instants]
+        return dict(zip(distinct, moved, strict=True))
 
     def _on_device(self, tile_weights: Tensor | None) -> Tensor | None:
         return None if tile_weights is None else tile_weights.to(self.background.device)
@@ -253,7 +249,7 @@ class TrainingRenderer:
         return min(options.sh_degree, int(progress / options.sh_start))
 
 
-def _alike(cameras: Sequence[Camera], tile_weights: Sequence[Tensor | None]) -> bool:
+def _alike(looks: Sequence[_Look]) -> bool:
     """Return whether views can be rendered together."""
-    sizes = {(camera.width, camera.height) for camera in cameras}
-    return len(sizes) == 1 and len({weights is None for weights in tile_weights}) == 1
+    sizes = {(look.camera.width, look.camera.height) for look in looks}
+    return len(sizes) == 1 and len({look.order.tile_weights is None for look in looks}) == 1

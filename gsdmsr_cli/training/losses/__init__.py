@@ -41,12 +41,12 @@ class Seen:
     Attributes:
         view: of the scene; ``pictures.signal(view, name)`` reads what it has beside its picture.
         pictures: of the size that the training compares at.
-        camera: of what was drawn, that size unless the term is ``of_depth``.
+        camera: of that size; for a term ``of_depth`` that of its frame.
         target: (3, H, W) uint8 true picture.
-        frame: what was drawn, without depth; for a term ``of_depth`` see ``draw_depth``.
-        instant, moment: when, and what was drawn.
+        instant, moment: when, and what is drawn.
         other_instant, other: the second instant that the term has chosen, and what the model is
             then; None unless it has an ``other_time``.
+        frame: of a term ``of_depth``, see ``draw_depth``; others draw what they want to see.
         seed: of random choices, other for every view and step; 0 unless a term ``needs_seed``.
         place: returns the camera that a view is drawn by, given the scene's and the time.
     """
@@ -55,11 +55,11 @@ class Seen:
     pictures: Pictures | HalvedPictures
     camera: Camera
     target: Tensor
-    frame: Frame
     instant: Instant
     moment: Moment
     other_instant: Instant | None = None
     other: Moment | None = None
+    frame: Frame | None = None
     seed: int = 0
     place: Callable[[Camera, float], Camera] = _as_recorded
 
@@ -68,14 +68,14 @@ class Seen:
         return self.place(self.pictures.camera(view), view.time)
 
     def counted(self) -> Tensor | None:
-        """Return the pixels (H, W) of what was drawn that the view's mask leaves, None for all."""
+        """Return which pixels (H, W) of the camera the view's mask leaves, or None for all."""
         mask = self.pictures.signal(self.view, MASK)
         if mask is None:
             return None
-        height, width = self.frame.alpha.shape
+        height, width = self.camera.height, self.camera.width
         if mask.shape != (height, width):
             mask = DECODERS[MASK].shrink(mask, (width, height))
-        return mask.to(self.frame.alpha.device)
+        return mask.to(self.moment.splats.means.device)
 
 
 class Term(ABC):
@@ -128,7 +128,7 @@ class Term(ABC):
 
     @abstractmethod
     def __call__(self, seen: Seen) -> Tensor:
-        """Return the value (), differentiable by what was drawn."""
+        """Return the value (), differentiable by the moments, or the frame if ``of_depth``."""
 
 
 def start_term(settings: Mapping[str, Any]) -> Term:

@@ -23,6 +23,7 @@ from gsdmsr_cli.scene.neighbours import LEAST_SHARE, neighbours
 from gsdmsr_cli.scene.pictured_flow import PicturedFlow
 from gsdmsr_cli.scene.scene import View
 from gsdmsr_cli.training.losses import Seen, Term
+from gsdmsr_cli.training.losses._comparing import nothing
 
 LEAST_COVER = 0.5
 """Pixels count where the splats cover this much or more."""
@@ -93,12 +94,12 @@ class Flow(Term):
         then = None if seen.other_instant is None else seen.other_instant.time
         other = next((v for v in self._beside.get(seen.view, ()) if v.time == then), None)
         if other is None or seen.other is None or self._engine is None:
-            return seen.frame.rgb.new_zeros(())
+            return nothing(seen)
         found = self._pictured.between(seen.pictures, seen.view, other)
-        true = torch.from_numpy(found).to(seen.frame.rgb.device)
         moved = screen_motion(seen.moment, seen.camera, seen.other, seen.camera_of(other))
-        drawn = blend_motion(moved, seen.moment.detach(), seen.camera, self._engine)
-        counts = true.isfinite().all(dim=2) & (seen.frame.alpha.detach() >= LEAST_COVER)
+        drawn, alpha = blend_motion(moved, seen.moment.detach(), seen.camera, self._engine)
+        true = torch.from_numpy(found).to(drawn.device)
+        counts = true.isfinite().all(dim=2) & (alpha.detach() >= LEAST_COVER)
         counted = seen.counted()
         if counted is not None:
             counts &= counted

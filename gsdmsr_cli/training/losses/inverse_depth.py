@@ -56,8 +56,8 @@ class InverseDepth(Term):
 
     def __call__(self, seen: Seen) -> Tensor:
         """Return log of the mean of alpha / (blended depth) over the pixels that count, ()."""
+        assert seen.frame is not None and seen.frame.depth is not None
         alpha, depth = seen.frame.alpha, seen.frame.depth
-        assert depth is not None
         counts = alpha.detach() >= LEAST_COVER
         counted = seen.counted()
         if counted is not None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -12,7 +13,8 @@ from training_checks import preset_of, trainer_of
 
 from gsdmsr_cli.gaussians.frame import Frame
 from gsdmsr_cli.gaussians.moment import Moment
-from gsdmsr_cli.model.model import Model
+from gsdmsr_cli.model.layer import Instant
+from gsdmsr_cli.model.model import STORED_AS, Model
 from gsdmsr_cli.ops.photometric import photometric_loss_twin
 from gsdmsr_cli.raster import load_engine
 from gsdmsr_cli.scene.camera import Camera
@@ -42,12 +44,14 @@ def compared(
     engine: str = "cpu",
     weights: Tensor | None = None,
     normal: float = 1.0,
+    screens: bool = True,
+    further: Tensor | None = None,
 ) -> ViewGradients:
     model: Model = trainer.model
     camera: Camera = trainer.renderer.pictures.camera(trainer.views[0])
     return compare(
-        load_engine(engine), model, Moment(model.splats), camera, BACKGROUND, target, ssim, 1,
-        weights, counted, normal,
+        load_engine(engine), model, Moment(model.splats), Instant(0.0), camera, BACKGROUND, target,
+        ssim, 1, weights, counted, normal, screens, further,
     )  # fmt: skip
 
 
@@ -97,6 +101,53 @@ def test_the_statistic_under_tiles_is_of_those_drawn_whatever_their_weights(
     assert found.tile_errors is not None
     per_tile = errors.detach().view(3, 16, 3, 16).sum(dim=(1, 3)).flatten() * (weights > 0)
     torch.testing.assert_close(found.tile_errors.float(), per_tile, rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize("engine", ["cpu", "reference"])
+@pytest.mark.parametrize("tiles", [False, True], ids=["", "tiles"])
+def test_the_picture_is_gone_back_through_again_only_for_a_statistic_of_its_own(
+    trainer: Trainer, engine: str, tiles: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """That is where tiles are weighted and somebody asks for the gradients on the screen."""
+    target = trainer.renderer.pictures.load(trainer.views[0])
+    weights = torch.tensor([0.0, 4.5, 0.5, 2.0, 0.0, 0.0, 0.0, 9.0, 1.0]) if tiles else None
+    times: list[int] = []
+    grad = torch.autograd.grad
+
+    def counted(*given: Any, **options: Any) -> Any:
+        times.append(1)
+        return grad(*given, **options)
+
+    monkeypatch.setattr(torch.autograd, "grad", counted)
+    found = []
+    for screens in (True, False):
+        times.clear()
+        found.append(compared(trainer, target, 0.0, None, engine, weights, 1.0, screens))
+        assert len(times) == (2 if tiles and screens and engine == "reference" else 1)
+    with_screens, without = found
+    for gradient, same in zip(with_screens.gradients, without.gradients, strict=True):
+        assert (gradient is None and same is None) or torch.equal(gradient, same)
+    assert with_screens.on_screen.any()
+
+
+@pytest.mark.parametrize("engine", ["cpu", "reference"])
+def test_what_is_added_to_the_loss_has_a_part_in_all_but_the_statistic(
+    trainer: Trainer, engine: str
+) -> None:
+    target = trainer.renderer.pictures.load(trainer.views[0])
+    more = 0.01 * trainer.model.splats.means.square().sum()
+    plain = compared(trainer, target, 0.2, None, engine)
+    found = compared(trainer, target, 0.2, None, engine, further=more)
+    assert float(found.loss) == pytest.approx(float(plain.loss + more.detach()))
+    assert torch.equal(found.on_screen, plain.on_screen)
+    for name, own, other in zip(
+        trainer.model.trained(), plain.gradients, found.gradients, strict=True
+    ):
+        if own is None or other is None:
+            assert own is other
+            continue
+        added = 0.02 * trainer.model.splats.means if name == f"{STORED_AS}means" else 0.0
+        torch.testing.assert_close(other, own + added)
 
 
 def test_what_does_not_count_may_be_anything(trainer: Trainer) -> None:

@@ -86,10 +86,9 @@ def test_half_the_size_counts_where_half_of_the_pixels_do(tmp_path: Path) -> Non
     assert pictures.signal(replace(view, signals={}), MASK) is None
 
 
-def test_gradients_are_the_same_where_nobody_asks_for_those_on_the_screen(
+def test_terms_cost_no_further_way_back_through_the_picture(
     tiny_scene: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """With a term, what is on the screen takes going back through the picture once more."""
     times: list[int] = []
     grad = torch.autograd.grad
 
@@ -98,18 +97,24 @@ def test_gradients_are_the_same_where_nobody_asks_for_those_on_the_screen(
         return grad(*given, **options)
 
     monkeypatch.setattr(torch.autograd, "grad", counted)
-    term = "losses.terms=[{name: temporal_smoothness}]"
-    trainer = trainer_of(tiny_scene, preset_of(term, "density.until=0.5"))
-    found = []
-    for screens in (True, False):
+    found = {}
+    for terms in ("[]", "[{name: temporal_smoothness, factor: 10.0}]"):
+        trainer = trainer_of(tiny_scene, preset_of(f"losses.terms={terms}"))
+        trainer.population.begin_moving()
+        rng = torch.Generator().manual_seed(1)
+        with torch.no_grad():  # motions begin as none
+            for name, tensor in trainer.model.trained().items():
+                if not name.startswith(STORED_AS):
+                    tensor += 0.01 * torch.randn(tensor.shape, generator=rng)
+        others = trainer.renderer.other_times(trainer.views[0], [0.0, 1.0], trainer.generator)
         times.clear()
-        phase = Phase(0.9, moving=False, screens=screens)
-        found += trainer.renderer.gradients(trainer.model, [Order(0)], phase)
-        assert len(times) == 1 + screens
-    for with_screens, without in zip(*(one.gradients for one in found), strict=True):
-        assert (with_screens is None) is (without is None)
-        assert with_screens is None or torch.equal(with_screens, without)
-    assert found[0].on_screen.any() and not found[1].on_screen.any()
+        phase = Phase(0.9, moving=True)
+        order = Order(0, other_times=others)
+        (found[terms],) = trainer.renderer.gradients(trainer.model, [order], phase)
+        assert len(times) == 1
+    without, held = found.values()
+    assert float(held.loss) > float(without.loss)
+    assert torch.equal(held.on_screen, without.on_screen)
 
 
 def test_those_on_the_screen_are_asked_for_while_splats_grow_or_are_gated(

@@ -56,9 +56,9 @@ def turned_by(splats: Splats, turn: Rotation, shift: list[float]) -> Splats:
 def seen_of(now: Splats, other: Splats | None, seed: int = 7, **moment: Any) -> Seen:
     """Return what a term is given of times 0.5 and 0.25; nothing of it is a picture."""
     pictureless: Any = None
-    given = [pictureless] * 5
+    given = [pictureless] * 4
     then = None if other is None else Moment(other)
-    return Seen(*given, Instant(0.5), Moment(now, **moment), Instant(0.25), then, seed)
+    return Seen(*given, Instant(0.5), Moment(now, **moment), Instant(0.25), then, seed=seed)
 
 
 def value(name: str, now: Splats, other: Splats, **options: Any) -> float:

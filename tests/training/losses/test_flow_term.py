@@ -55,11 +55,10 @@ def value_of(now: Splats, then: Splats, true: float, mask: Tensor | None = None)
     flow = np.zeros((SIZE, SIZE, 2), np.float32)
     flow[..., 0], flow[:, :2] = true, np.nan
     term._pictured.between = lambda *_: flow  # type: ignore[method-assign]
-    frame = engine.rasterize(Moment(now), camera, torch.ones(3))
     target = torch.zeros(3, SIZE, SIZE, dtype=torch.uint8)
     pictures: Any = Known()
     instants = Instant(0.0), Moment(now), Instant(1.0), Moment(then)
-    return term(Seen(views[0], pictures, camera, target, frame, *instants))
+    return term(Seen(views[0], pictures, camera, target, *instants))
 
 
 def test_its_value_is_the_mean_error_in_sides_of_the_picture() -> None:

@@ -54,7 +54,7 @@ def value_of(splats: Splats, mask: Tensor | None = None, distance: float = DISTA
     target = torch.zeros(3, SIZE, SIZE, dtype=torch.uint8)
     unread: Any = pictures
     return start_term({"name": "inverse_depth"})(
-        Seen(view, unread, camera, target, frame, Instant(0.0), moment)
+        Seen(view, unread, camera, target, Instant(0.0), moment, frame=frame)
     )
 
 

@@ -60,7 +60,7 @@ def test_terms_of_canonical_splats_count_at_the_first_moment_alone(
 
     def value(self: InverseDepth, seen: Seen) -> torch.Tensor:
         asked.append(seen.instant.time)
-        assert seen.frame.depth is not None
+        assert seen.frame is not None and seen.frame.depth is not None
         return seen.frame.depth.mean()
 
     monkeypatch.setattr(InverseDepth, "__call__", value)
