@@ -12,6 +12,7 @@ import urllib.request
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 from urllib.error import HTTPError
 
@@ -21,7 +22,8 @@ import pytest
 from training_checks import begun_run
 
 from gsdmsr_cli.moving.container import from_bytes
-from gsdmsr_cli.viewing.showing import MOST_POINTS, _curve
+from gsdmsr_cli.options.preset import load_preset
+from gsdmsr_cli.viewing.showing import MOST_POINTS, _curve, _time_left
 from gsdmsr_cli.viewing.snapshots import snapshot_path
 
 QUICK = "splats.count=200", "training.static_until=0", "training.threads=1"
@@ -108,6 +110,22 @@ def test_no_run_is_one_line(tmp_path: Path) -> None:
     line = [sys.executable, "-m", "gsdmsr_cli", "view", str(tmp_path)]
     done = subprocess.run(line, check=False, capture_output=True, text=True)
     assert done.returncode == 3 and "not a run folder" in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("preset", "length", "left"),
+    [
+        ("video", ["training.budget=4m", "training.budget_power=0.5"], 900.0),  # 1 / 16 is over
+        ("video", ["training.steps=100", "training.budget_power=0.5"], 180.0),
+        ("persistent", ["training.budget=4m", "training.budget_power=0.5"], 180.0),
+    ],
+)
+def test_time_is_left_as_progress_goes_with_time(
+    preset: str, length: list[str], left: float
+) -> None:
+    """A stream's progress is a share of its moments, each of which has a length of its own."""
+    run: Any = SimpleNamespace(preset=load_preset(preset, None, length))
+    assert _time_left(run, 60.0, 0.25) == pytest.approx(left)
 
 
 def test_a_long_curve_is_thinned_and_keeps_its_end() -> None:
