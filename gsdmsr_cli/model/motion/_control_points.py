@@ -82,9 +82,7 @@ class ControlPoints(Layer):
 
     def at(self, moment: Moment, instant: Instant) -> Moment:
         """Return the moved splats."""
-        transforms = self._transforms(self.control_points, instant.time)
-        near = self._neighbours(moment.splats.means)
-        given = self.control_points, self.log_radii, transforms, near
+        given = self._followed(moment, self._deformation(self.control_points, instant.time))
         return replace(moment, splats=skin.skin(moment.splats, *given))
 
     def at_instants(self, moment: Moment, instants: Sequence[Instant]) -> list[Moment]:
@@ -94,13 +92,17 @@ class ControlPoints(Layer):
         On a CPU there is nothing to gain by it.
         """
         if len(instants) == 1 or choose(self.control_points) != "cuda":
-            return [self.at(moment, instant) for instant in instants]
-        deformations = self._deformations(self.control_points, [i.time for i in instants])
-        transforms = skin.transforms(self.control_points, deformations)
-        near = self._neighbours(moment.splats.means)
-        given = self.control_points, self.log_radii, transforms, near
+            return super().at_instants(moment, instants)
+        times = [instant.time for instant in instants]
+        given = self._followed(moment, self._deformations(self.control_points, times))
         moved = skin.skin_at_times(moment.splats, *given)
         return [replace(moment, splats=splats) for splats in moved]
+
+    def _followed(self, moment: Moment, deformations: Tensor) -> tuple[Tensor, ...]:
+        """Return points, radii and transforms at these deformations, and whom splats follow."""
+        transforms = skin.transforms(self.control_points, deformations)
+        near = self._neighbours(moment.splats.means)
+        return self.control_points, self.log_radii, transforms, near
 
     def _transforms(self, points: Tensor, time: float) -> Tensor:
         return skin.transforms(points, self._deformation(points, time))
