@@ -11,8 +11,12 @@ from typing import Any
 import numpy as np
 from datasets import write_picture
 
-from gsdmsr_cli.demo.synthetic import CAMERA_ANGLE_X, camera_on_dome, draw, solids_at
+from gsdmsr_cli.demo.solids import Ball
+from gsdmsr_cli.demo.synthetic import CAMERA_ANGLE_X, Placed, camera_on_dome, draw, solids_at
 from gsdmsr_cli.scene.camera import Camera
+
+VISITOR = (0.35, 0.35, 0.0), 0.35
+"""Centre and radius of the ball that comes in [world units]."""
 
 
 def cameras_of(count: int, size: int) -> list[Camera]:
@@ -29,6 +33,7 @@ def write_rig(
     moments: int = 4,
     span: float = 0.05,
     missing: Collection[tuple[int, int]] = (),
+    visitor: int | None = None,
 ) -> Path:
     """Write a scene of which a part of the demo's motion is seen.
 
@@ -39,6 +44,7 @@ def write_rig(
         moments: evenly spaced.
         span: the demo's time at the last of them.
         missing: pairs of a moment and a train camera of which there is no picture.
+        visitor: moment from which on a second ball stands in the scene, or None.
     """
     splits = {"train": cameras_of(cameras, size)}
     splits |= {key: [camera_on_dome(math.pi / cameras, 0.6, size)] for key in ("val", "test")}
@@ -46,11 +52,14 @@ def write_rig(
         frames: list[dict[str, Any]] = []
         for moment in range(moments):
             time = moment / max(moments - 1, 1)
+            solids = solids_at(span * time)
+            if visitor is not None and moment >= visitor:
+                solids.append(Placed(Ball(VISITOR[1]), np.eye(3), np.array(VISITOR[0])))
             for i, camera in enumerate(own):
                 if split == "train" and (moment, i) in missing:
                     continue
                 name = f"{split}/c{i}_{moment:03d}"
-                write_picture(folder / f"{name}.png", draw(solids_at(span * time), camera))
+                write_picture(folder / f"{name}.png", draw(solids, camera))
                 frames.append(
                     {"file_path": f"./{name}", "time": time, "transform_matrix": _pose(camera)}
                 )

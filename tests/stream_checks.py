@@ -24,6 +24,9 @@ OPTIONS = (
 WAYS = "persistent", "hicom", "3dgstream"
 """Presets of streams."""
 
+NEWCOMERS = "layers=[{name: exposure}, {name: newcomers, count: 30}]"
+"""Splats for what is new, beside the layer that presets of streams have."""
+
 
 def preset_of(*options: str, way: str = WAYS[0]) -> Preset:
     return load_preset(way, None, [*OPTIONS, *options])

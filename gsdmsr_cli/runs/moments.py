@@ -17,6 +17,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import torch
@@ -37,6 +38,8 @@ SCHEMA = 1
 
 TRACKS = "offsets", "turns"
 """What a moment after the first holds, (R, 3) and (R, 4), see ``model.motion._streamed``."""
+
+NOTHING: Mapping[str, Tensor] = MappingProxyType({})
 
 _NAME = re.compile(r"(\d{6,})\.safetensors")
 
@@ -127,6 +130,7 @@ def write(
     values: Mapping[str, Tensor],
     rounding: Rounding,
     told: object,
+    whole: Mapping[str, Tensor] = NOTHING,
 ) -> int:
     """Write a moment after the first; return its bytes.
 
@@ -137,16 +141,20 @@ def write(
         values: see ``TRACKS``, all finite.
         rounding: what they are rounded to.
         told: plain JSON that is kept with it.
+        whole: further tensors, which are written in half precision, means in single.
 
     Raises:
         DataError: it cannot be written, or its keyframe not be read.
     """
     lengths = dict(zip(TRACKS, (rounding.place_step, rounding.turn_step), strict=True))
     key = moment - moment % rounding.keyframe_every
-    whole = {n: steps.rounded(values[n].detach().cpu().numpy(), lengths[n]) for n in TRACKS}
+    levels_of = {n: steps.rounded(values[n].detach().cpu().numpy(), lengths[n]) for n in TRACKS}
     before = {} if key in (0, moment) else _levels(root, read(root, key))
     packed, described = {}, {}
-    for name, levels in whole.items():
+    for name, tensor in whole.items():
+        own = tensor.detach().cpu()
+        packed[name] = (own if name.endswith("means") else own.half()).contiguous()
+    for name, levels in levels_of.items():
         packed[name], described[name] = steps.encode(levels - before.get(name, 0))
     about = {"time": time, "keyframe": key, "steps": lengths, "packed": described, "told": told}
     return _write(root, moment, packed, about)

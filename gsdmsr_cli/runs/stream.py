@@ -9,7 +9,9 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from gsdmsr_cli.gaussians.splats import NAMES
 from gsdmsr_cli.ground.errors import DataError
+from gsdmsr_cli.model.layers.newcomers import OWN, PAST, READY, TIMES
 from gsdmsr_cli.model.model import MOTION
 from gsdmsr_cli.runs import moments
 from gsdmsr_cli.runs.checkpoints import WRONG, Checkpoint
@@ -43,7 +45,7 @@ def load(root: Path) -> Checkpoint:
         raise DataError(f"{moments.path_of(root, 0)}: is not there; train again with --overwrite")
     first, *later = (moments.read(root, number) for number in numbers)
     try:
-        tensors = first.tensors | _tracks(root, first, later)
+        tensors = first.tensors | _tracks(root, first, later) | _newcomers(first, later)
         told = Told(**(later or [first])[-1].about["told"])
         files = [first, *later]
         digest = hashlib.sha256("".join(file.sha256 for file in files).encode()).hexdigest()
@@ -66,11 +68,30 @@ def _tracks(root: Path, first: moments.Written, later: list[moments.Written]) ->
         later = [first]
     if len({len(each["offsets"]) for each in found}) != 1:
         raise ValueError("moments of different numbers of rows")
-    times = [float(file.about["time"]) for file in (first, *later)]
-    tensors = {f"{MOTION}.times": torch.tensor(times, dtype=torch.float64)}
+    tensors = {f"{MOTION}.times": _times([first, *later])}
     for name in moments.TRACKS:
-        *past, last = (each[name] for each in found)
-        tensors[f"{MOTION}.{name}"] = last
-        empty = last.new_zeros(len(last), 0, last.shape[1])
-        tensors[f"{MOTION}.past_{name}"] = torch.stack(past, dim=1) if past else empty
+        last, past = _apart([each[name] for each in found])
+        tensors |= {f"{MOTION}.{name}": last, f"{MOTION}.past_{name}": past}
     return tensors
+
+
+def _newcomers(first: moments.Written, later: list[moments.Written]) -> dict[str, Tensor]:
+    """Return the tensors of the layer ``newcomers``, none where the model lacks it."""
+    if OWN + READY not in first.tensors:
+        return {}
+    later = later or [first]
+    tensors = {OWN + TIMES: _times([first, *later])}
+    for name in NAMES:
+        last, past = _apart([file.tensors[OWN + name].float() for file in later])
+        tensors |= {OWN + name: last, OWN + PAST + name: past}
+    return tensors
+
+
+def _times(files: list[moments.Written]) -> Tensor:
+    return torch.tensor([float(file.about["time"]) for file in files], dtype=torch.float64)
+
+
+def _apart(moments_of: list[Tensor]) -> tuple[Tensor, Tensor]:
+    """Return the last of some tensors (R, ...), and the others as one (R, K, ...)."""
+    *past, last = moments_of
+    return last, torch.stack(past, dim=1) if past else last[:, None][:, :0]

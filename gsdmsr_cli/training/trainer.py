@@ -159,9 +159,13 @@ class Trainer:
 
     def start_workers(self, prepare: Callable[[], object]) -> None:
         """Get workers for a step's views, until the context ends; see ``WorkerPool.start``."""
-        capacity = max(self.preset.density.cap, len(self.model.splats))
+        capacity = self._most_splats()
         views = most_of(self.views_per_step, self.ranks.size)
         self.workers.start(self.model, capacity, views, prepare)
+
+    def _most_splats(self) -> int:
+        """Return how many splats there will be at most."""
+        return max(self.preset.density.cap, len(self.model.splats))
 
     def step(self) -> Step:
         """Choose views, take their gradients, let Adam step, let events change the splats."""

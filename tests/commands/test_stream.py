@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 import torch
 from rigs import write_rig
-from stream_checks import EACH, FIRST, MOMENTS, OPTIONS, WAYS
+from stream_checks import EACH, FIRST, MOMENTS, NEWCOMERS, OPTIONS, WAYS
 
 from gsdmsr_cli.benchmark.kills import same
 from gsdmsr_cli.model.building import load_model
@@ -44,14 +44,16 @@ def run(rig: Path, tmp_path: Path, gsdmsr: Gsdmsr) -> Path:
     return tmp_path / "run"
 
 
-@pytest.fixture(params=WAYS)
+@pytest.fixture(params=[*WAYS, "newcomers"])
 def any_run(
     rig: Path, tmp_path: Path, gsdmsr: Gsdmsr, request: pytest.FixtureRequest
 ) -> tuple[str, Path]:
-    """A stream of each way that has come to its end, and the way."""
-    way, out = request.param, tmp_path / "run"
+    """A stream of each way, and one with newcomers, that has come to its end; and the way."""
+    way, out, further = request.param, tmp_path / "run", list[str]()
+    if way == "newcomers":
+        way, further = "persistent", [f"--set={NEWCOMERS}"]
     given = "--stream", "--preset", way, "--data", rig, "--out", out
-    assert gsdmsr("train", *given, *SETTINGS) == 0
+    assert gsdmsr("train", *given, *SETTINGS, *further) == 0
     return way, out
 
 

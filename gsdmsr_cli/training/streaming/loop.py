@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, fields
 from typing import Any
 
+from gsdmsr_cli.model.layers.newcomers import OF_ALL_MOMENTS, OWN
 from gsdmsr_cli.model.model import MOTION, MOVING
 from gsdmsr_cli.runs import moments
 from gsdmsr_cli.runs.moments import Rounding
@@ -145,9 +146,12 @@ def write_moment(run: Run, trainer: StreamTrainer) -> int:
         model, motion = trainer.model, trainer.motion
         stay = {n: t for n, t in model.tensors().items() if not n.startswith(f"{MOTION}.")}
         stay |= {f"{MOTION}.{name}": motion.tensors()[name] for name in motion.staying}
+        stay = {name: tensor for name, tensor in stay.items() if name not in OF_ALL_MOMENTS}
         if model.moving < len(model.splats):
             stay[MOVING] = trainer.checkpoint().tensors[MOVING]
         return moments.write_first(run.root, stay, len(motion.offsets), time, told)
     values = {"offsets": trainer.motion.offsets, "turns": trainer.motion.turns}
     rounding = Rounding(options.place_step, options.turn_step, options.keyframe_every)
-    return moments.write(run.root, clock.moment, time, values, rounding, told)
+    own = {} if trainer.newcomers is None else trainer.newcomers.newest.tensors()
+    whole = {OWN + name: tensor for name, tensor in own.items()}
+    return moments.write(run.root, clock.moment, time, values, rounding, told, whole)

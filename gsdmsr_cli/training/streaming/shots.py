@@ -44,6 +44,11 @@ def shots_of(views: Sequence[View]) -> list[Shot]:
 def check_options(preset: Preset) -> None:
     """Raise UsageError if options do not go together with a stream; no data is needed."""
     if not preset.stream.enabled:
+        if any(layer["name"] == "newcomers" for layer in preset.layers):
+            raise UsageError(
+                "layers has newcomers, which are for what is new at a moment of a stream; add "
+                "--stream, or leave them out"
+            )
         return
     motion, start = preset.motion["name"], preset.splats.sh_start
     if not _is_streamed(motion):

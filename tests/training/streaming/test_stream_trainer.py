@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 from rigs import write_rig
-from stream_checks import EACH, FIRST, MOMENTS, WAYS, preset_of, stream_trainer, through
+from stream_checks import EACH, FIRST, MOMENTS, NEWCOMERS, WAYS, preset_of, stream_trainer, through
 from training_checks import assert_same_tensors, copies, run_of
 
 from gsdmsr_cli.backends.cpu import jit
@@ -25,6 +25,10 @@ def rig(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 every_way = pytest.mark.parametrize("way", WAYS)
+
+with_newcomers = pytest.mark.parametrize(
+    ("way", "further"), [*((way, ()) for way in WAYS), *((way, (NEWCOMERS,)) for way in WAYS)]
+)
 
 
 @pytest.fixture
@@ -160,27 +164,27 @@ def test_what_is_drawn_stays_as_a_moment_ends(rig: Path, way: str) -> None:
     torch.testing.assert_close(seen[1].quats, seen[0].quats, rtol=0, atol=1e-5)
 
 
-@every_way
-def test_workers_change_nothing(rig: Path, way: str) -> None:
+@with_newcomers
+def test_workers_change_nothing(rig: Path, way: str, further: tuple[str, ...]) -> None:
     if not (sys.platform.startswith("linux") and jit.set_threads(2) == 2 and jit.may_fork()):
         pytest.skip("processes cannot be forked here, or there is one core")
-    with stream_trainer(rig, way=way) as helped:
+    with stream_trainer(rig, *further, way=way) as helped:
         helped.start_workers(lambda: None)
         assert len(helped.workers) == 2
         through(helped, MOMENTS)
         found = copies(helped.checkpoint().tensors)
     jit.set_threads(0)
-    alone = stream_trainer(rig, way=way)
+    alone = stream_trainer(rig, *further, way=way)
     through(alone, MOMENTS)
     assert_same_tensors(found, copies(alone.checkpoint().tensors))
 
 
-@every_way
-@pytest.mark.parametrize("steps", [FIRST // 2, FIRST, FIRST + 3, FIRST + EACH + 5])
+@with_newcomers
+@pytest.mark.parametrize("steps", [FIRST // 2, FIRST, FIRST + 2, FIRST + 3, FIRST + EACH + 5])
 def test_a_stream_that_is_resumed_ends_as_one_that_was_not(
-    rig: Path, tmp_path: Path, steps: int, way: str
+    rig: Path, tmp_path: Path, steps: int, way: str, further: tuple[str, ...]
 ) -> None:
-    whole, first, second = (stream_trainer(rig, way=way) for _ in range(3))
+    whole, first, second = (stream_trainer(rig, *further, way=way) for _ in range(3))
     through(whole, MOMENTS)
     while first.clock.step < steps:
         if first.clock.progress >= 1:
