@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_right
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import torch
@@ -183,17 +182,9 @@ class Newcomers(Layer):
                 tensor[lost] = hidden[name].to(tensor)[lost]
         return lost
 
-    def restore(self, tensors: Mapping[str, Tensor], count: int) -> None:
-        """See ``Layer.restore``; there may be any number of moments and of newcomers."""
-        for name, own in self.past.items():
-            saved = tensors.get(PAST + name)
-            if saved is not None and saved.dim() == own.dim():
-                own.data = own.new_zeros(saved.shape)
-        super().restore(tensors, count)
-
     def check(self) -> None:
         """Raise ValueError unless all tensors are of as many newcomers and moments."""
-        self.newest.__post_init__()
+        Splats(**self.newest.tensors())
         for name, tensor in self.newest.tensors().items():
             expected = (len(self), len(self.times) - 2, *tensor.shape[1:])
             if tuple(self.past[name].shape) != expected:
