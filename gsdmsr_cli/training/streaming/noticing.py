@@ -20,8 +20,8 @@ from gsdmsr_cli.ground.splatting_constants import NEAR
 from gsdmsr_cli.ops.planes import Box
 from gsdmsr_cli.scene.camera import Camera
 
-LEAST_CAMERAS = 3
-"""A place that fewer cameras see is not judged."""
+LEAST_CAMERAS, LEAST_SHARE = 3, 1 / 3
+"""A place that fewer cameras see, or a smaller share of them, is not judged."""
 
 HIDDEN = 0.25
 """Share of the cameras that may see something else there, which stands before it."""
@@ -47,10 +47,18 @@ class Look:
 
 
 class Places(NamedTuple):
-    """Where something new stands: M places (M, 3) [world units], and its colours there (M, 3)."""
+    """Where something new stands.
+
+    Attributes:
+        means: (M, 3) places [world units].
+        colours: (M, 3) what cameras see there.
+        apart: how far apart places have been looked for at first [world units]: a place speaks for
+            no more than what lies within half of that.
+    """
 
     means: Tensor
     colours: Tensor
+    apart: float
 
 
 @torch.no_grad()
@@ -82,7 +90,7 @@ def find_places(
     """
     low, high = (torch.tensor(corner, dtype=torch.float32) for corner in box)
     places = low + (high - low) * torch.rand(_DRAWN, 3, generator=generator)
-    apart = float((high - low).max()) / _DRAWN ** (1 / 3)
+    apart = first = float((high - low).max()) / _DRAWN ** (1 / 3)
     scores = _scores(looks, places)
     for _ in range(_ROUNDS):
         best = scores.topk(_KEPT).indices
@@ -94,14 +102,15 @@ def find_places(
     found = places[scores > least]
     found = found[torch.randperm(len(found), generator=generator)[:most]]
     colours = torch.stack([_sample(one.true, one, found) for one in looks])
-    return Places(found, colours.nanmedian(dim=0).values)
+    return Places(found, colours.nanmedian(dim=0).values, first)
 
 
 def _scores(looks: Sequence[Look], places: Tensor) -> Tensor:
     """Return the error (M,) that all cameras but some see at places (M, 3), 0 if too few do."""
     errors = torch.stack([_sample(one.errors, one, places) for one in looks])
     scores = errors.nanquantile(HIDDEN, dim=0)
-    return torch.where(errors.isfinite().sum(dim=0) >= LEAST_CAMERAS, scores, 0.0)
+    least = max(LEAST_CAMERAS, LEAST_SHARE * len(looks))
+    return torch.where(errors.isfinite().sum(dim=0) >= least, scores, 0.0)
 
 
 def _sample(image: Tensor, one: Look, places: Tensor) -> Tensor:

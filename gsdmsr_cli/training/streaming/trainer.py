@@ -248,7 +248,8 @@ class StreamTrainer(Trainer):
         count = len(found.means)
         if count > SPACING_OF:
             free = free[:count]
-            newcomers.appear(free, found.means, spacing(found.means).log(), found.colours)
+            sizes = spacing(found.means).clamp(max=found.apart / 2)  # far from others it is no ball
+            newcomers.appear(free, found.means, sizes.log(), found.colours)
             self._stop(dict.fromkeys(_OF_NEWCOMERS, free))
             self.population.average.clear()
         self._placed = True

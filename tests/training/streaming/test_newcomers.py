@@ -138,7 +138,7 @@ def test_only_those_that_have_faded_are_placed_anew(
     layer = newcomers_of(trainer)
     layer.newest.logit_opacities.data[:10] = 2.0
     there = layer.newest.means.detach().clone()
-    found = Places(torch.rand(6, 3), torch.rand(6, 3))
+    found = Places(torch.rand(6, 3), torch.rand(6, 3), 0.5)
     monkeypatch.setattr(streaming, "find_places", lambda *_: found)
     trainer._place(layer)
     own = layer.newest
@@ -146,7 +146,9 @@ def test_only_those_that_have_faded_are_placed_anew(
     assert torch.equal(own.means[:10], there[:10]) and torch.equal(own.means[16:], there[16:])
     torch.testing.assert_close(own.sh[10:16, 0] * SH_C0 + 0.5, found.colours)
     assert (own.logit_opacities[10:16].sigmoid() - BEGIN).abs().max() < 1e-6
-    torch.testing.assert_close(own.log_scales[10:16, 0], spacing(found.means).log())
+    sizes = spacing(found.means)
+    assert (sizes > 0.25).any()
+    torch.testing.assert_close(own.log_scales[10:16, 0], sizes.clamp(max=0.25).log())
     assert not layer.faded()[:16].any() and layer.faded()[16:].all()
 
 
