@@ -132,7 +132,8 @@ class TrainingRenderer:
     def _can_be_at_once(self, model: Model, looks: Sequence[_Look]) -> bool:
         able = isinstance(self.engine, ComparingViews) and not model.shades
         whole = self.preset.losses.inliers == 1 and all(look.mask is None for look in looks)
-        return able and whole and _alike(looks)
+        weights = [look.order.tile_weights for look in looks]
+        return able and whole and _alike([look.camera for look in looks], weights)
 
     def _at_once(self, model: Model, looks: Sequence[_Look], phase: Phase) -> list[ViewGradients]:
         assert isinstance(self.engine, ComparingViews)
@@ -249,7 +250,7 @@ class TrainingRenderer:
         return min(options.sh_degree, int(progress / options.sh_start))
 
 
-def _alike(looks: Sequence[_Look]) -> bool:
+def _alike(cameras: Sequence[Camera], tile_weights: Sequence[Tensor | None]) -> bool:
     """Return whether views can be rendered together."""
-    sizes = {(look.camera.width, look.camera.height) for look in looks}
-    return len(sizes) == 1 and len({look.order.tile_weights is None for look in looks}) == 1
+    sizes = {(camera.width, camera.height) for camera in cameras}
+    return len(sizes) == 1 and len({weights is None for weights in tile_weights}) == 1
