@@ -7,7 +7,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
+import pytest
 import torch
 from torch import Tensor
 
@@ -45,6 +47,19 @@ def preset_of(*options: str, motion: str = "multiscale") -> Preset:
 def trainer_of(data: Path, preset: Preset, engine: Engine | None = None) -> Trainer:
     pictures = Pictures((1.0, 1.0, 1.0), preset.data.downscale, 1 << 24)
     return Trainer(read_scene(data), preset, engine or best_engine("cpu"), pictures)
+
+
+def counted_ways_back(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """Return a list that grows by one entry whenever gradients are taken."""
+    times: list[int] = []
+    grad = torch.autograd.grad
+
+    def counted(*given: Any, **options: Any) -> Any:
+        times.append(1)
+        return grad(*given, **options)
+
+    monkeypatch.setattr(torch.autograd, "grad", counted)
+    return times
 
 
 def run_of(trainer: Trainer, root: Path) -> Run:

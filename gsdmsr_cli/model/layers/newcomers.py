@@ -24,6 +24,9 @@ from gsdmsr_cli.model.parameter import Parameter
 from gsdmsr_cli.ops.finite import finite_rows
 from gsdmsr_cli.options.strict import require, require_rates
 
+STREAMED = True
+"""It is learnt moment after moment."""
+
 FADED = 0.05
 """Newcomers less opaque than this are placed anew."""
 
@@ -132,8 +135,7 @@ class Newcomers(Layer):
         """Return S rows that are not seen, to be the last of those of ``splats``, which move."""
         self.ready.fill_(1)
         hidden = _hidden(len(self), tuple(splats.sh.shape[1:])).map(lambda t: t.to(splats.means))
-        if len(splats):
-            hidden.means.copy_(splats.means.mean(dim=0))
+        hidden.means.copy_(splats.means.mean(dim=0))
         return hidden
 
     @torch.no_grad()

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
+from gsdmsr_cli.drawing.depth import depths_of
 from gsdmsr_cli.drawing.flow import project
 from gsdmsr_cli.ground.splatting_constants import NEAR
 from gsdmsr_cli.ops.planes import Box
@@ -117,8 +118,7 @@ def _sample(image: Tensor, one: Look, places: Tensor) -> Tensor:
     """Return what an image (H, W, ...) of a view shows at places (M, 3); NaN outside of it."""
     camera = one.camera
     x, y = project(places, camera).unbind(dim=1)
-    axis = torch.from_numpy(camera.rotation[2].copy()).to(places)
-    ahead = places @ axis + float(camera.translation[2]) > NEAR
+    ahead = depths_of(places, camera) > NEAR
     inside = ahead & (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
     column = x.clamp(0, camera.width - 1).long()
     row = y.clamp(0, camera.height - 1).long()

@@ -5,9 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from statistics import median
+from types import ModuleType
 
 from gsdmsr_cli.ground import plugins
 from gsdmsr_cli.ground.errors import DataError, UsageError
+from gsdmsr_cli.model import layers
 from gsdmsr_cli.model import motion as motions
 from gsdmsr_cli.options.preset import Preset
 from gsdmsr_cli.scene.scene import Scene, View
@@ -44,15 +46,17 @@ def shots_of(views: Sequence[View]) -> list[Shot]:
 def check_options(preset: Preset) -> None:
     """Raise UsageError if options do not go together with a stream; no data is needed."""
     if not preset.stream.enabled:
-        if any(layer["name"] == "newcomers" for layer in preset.layers):
+        streamed = [one["name"] for one in preset.layers if _is_streamed(layers, one["name"])]
+        if streamed:
             raise UsageError(
-                "layers has newcomers, which are for what is new at a moment of a stream; add "
-                "--stream, or leave them out"
+                f"layers has {streamed[0]}, which is learnt moment after moment; add --stream, or "
+                "leave it out"
             )
         return
     motion, start = preset.motion["name"], preset.splats.sh_start
-    if not _is_streamed(motion):
-        known = ", ".join(filter(_is_streamed, plugins.names(motions.__name__)))
+    if not _is_streamed(motions, motion):
+        names = plugins.names(motions.__name__)
+        known = ", ".join(name for name in names if _is_streamed(motions, name))
         raise UsageError(
             f"motion.name is {motion}, which is not learnt moment after moment; with --stream it "
             f"has to be one of {known}, as in --preset persistent"
@@ -71,9 +75,9 @@ def check_options(preset: Preset) -> None:
         raise UsageError(f"saliency.gate is {preset.saliency.gate}; allowed with --stream: none")
 
 
-def _is_streamed(motion: str) -> bool:
-    """Return whether a motion is learnt moment after moment, which its module says."""
-    return bool(getattr(plugins.load(motions.__name__, motion), "STREAMED", False))
+def _is_streamed(package: ModuleType, name: str) -> bool:
+    """Return whether a plug-in is learnt moment after moment, which its module says."""
+    return bool(getattr(plugins.load(package.__name__, name), "STREAMED", False))
 
 
 def check_scene(scene: Scene) -> list[str]:

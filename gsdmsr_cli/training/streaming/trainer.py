@@ -93,6 +93,10 @@ class StreamTrainer(Trainer):
         return next(found, None)
 
     @property
+    def _newcomers_count(self) -> int:
+        return 0 if self.newcomers is None else len(self.newcomers)
+
+    @property
     def frozen(self) -> bool:
         """Whether the canonical splats stay as they are, as at all moments but the first."""
         return self.clock.moment > 0
@@ -160,8 +164,7 @@ class StreamTrainer(Trainer):
         self._times = [shot.time for shot in self.shots[: self.clock.moment + 1]]
 
     def _most_splats(self) -> int:
-        own = 0 if self.newcomers is None else len(self.newcomers)
-        return super()._most_splats() + own
+        return super()._most_splats() + self._newcomers_count
 
     def _beginning(self) -> Scene:
         return first_shot(self.scene)
@@ -190,11 +193,9 @@ class StreamTrainer(Trainer):
         """Return the splats that move at this moment, the one before and the first."""
         canonical = Moment(self._moving())
 
-        own = 0 if self.newcomers is None else len(self.newcomers)
-
         def at(time: float) -> Splats:
             splats = self.motion.at(canonical, Instant(time)).splats
-            return splats.map(lambda tensor: tensor[: len(tensor) - own])
+            return splats.map(lambda tensor: tensor[: len(tensor) - self._newcomers_count])
 
         with torch.no_grad():
             before, first = at(self._times[-2]), at(self._times[0])

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
 from datasets import noise
 from torch import Tensor
-from training_checks import preset_of, trainer_of
+from training_checks import counted_ways_back, preset_of, trainer_of
 
 from gsdmsr_cli.gaussians.frame import Frame
 from gsdmsr_cli.gaussians.moment import Moment
@@ -111,14 +110,7 @@ def test_the_picture_is_gone_back_through_again_only_for_a_statistic_of_its_own(
     """That is where tiles are weighted and somebody asks for the gradients on the screen."""
     target = trainer.renderer.pictures.load(trainer.views[0])
     weights = torch.tensor([0.0, 4.5, 0.5, 2.0, 0.0, 0.0, 0.0, 9.0, 1.0]) if tiles else None
-    times: list[int] = []
-    grad = torch.autograd.grad
-
-    def counted(*given: Any, **options: Any) -> Any:
-        times.append(1)
-        return grad(*given, **options)
-
-    monkeypatch.setattr(torch.autograd, "grad", counted)
+    times = counted_ways_back(monkeypatch)
     found = []
     for screens in (True, False):
         times.clear()

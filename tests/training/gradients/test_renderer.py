@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 from datasets import noise, write_picture
-from training_checks import STEPS, preset_of, trainer_of
+from training_checks import STEPS, counted_ways_back, preset_of, trainer_of
 
 from gsdmsr_cli.gaussians.moment import Moment
 from gsdmsr_cli.model.model import STORED_AS, Model
@@ -89,14 +89,7 @@ def test_half_the_size_counts_where_half_of_the_pixels_do(tmp_path: Path) -> Non
 def test_terms_cost_no_further_way_back_through_the_picture(
     tiny_scene: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    times: list[int] = []
-    grad = torch.autograd.grad
-
-    def counted(*given: Any, **options: Any) -> Any:
-        times.append(1)
-        return grad(*given, **options)
-
-    monkeypatch.setattr(torch.autograd, "grad", counted)
+    times = counted_ways_back(monkeypatch)
     found = {}
     for terms in ("[]", "[{name: temporal_smoothness, factor: 10.0}]"):
         trainer = trainer_of(tiny_scene, preset_of(f"losses.terms={terms}"))
