@@ -40,10 +40,11 @@ def connected(workers: str) -> Iterator[Any]:
         ) from error
     try:
         ray.init(log_to_driver=False, logging_level="error", **how)
-    except (ConnectionError, RuntimeError, ImportError, ValueError) as error:
+    except (OSError, RuntimeError, ImportError, ValueError, ray.exceptions.RayError) as error:
         raise DataError(
             f"--workers {workers}: no cluster answers ({str(error).splitlines()[0][:200]}); start "
-            "one with ray start --head"
+            "one with ray start --head. Where that machine has ~/.ray/auth_token, this one needs "
+            "the same file and RAY_AUTH_MODE=token"
         ) from error
     try:
         yield ray

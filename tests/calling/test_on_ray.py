@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -167,4 +168,19 @@ def test_what_is_no_cluster_is_refused(workers: str) -> None:
 def test_without_ray_it_is_told_how_to_get_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "ray", None)
     with pytest.raises(UsageError, match=r"--workers needs ray.*pip install 'gsdmsr\[ray\]'"):
+        connected("auto").__enter__()
+
+
+def test_a_cluster_that_asks_for_a_token_is_no_internal_error(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    class RayError(Exception):
+        """As Ray has it: of no class of Python's."""
+
+    def init(**_: Any) -> None:
+        raise RayError("InvalidAuthToken")
+
+    ray = SimpleNamespace(init=init, exceptions=SimpleNamespace(RayError=RayError))
+    monkeypatch.setitem(sys.modules, "ray", ray)
+    with pytest.raises(DataError, match=r"InvalidAuthToken.*~/\.ray/auth_token.*RAY_AUTH_MODE"):
         connected("auto").__enter__()
