@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from pathlib import Path
+from statistics import fmean
 
+from gsdmsr_cli.drawing.splatting import draw
 from gsdmsr_cli.formats import read_scene
 from gsdmsr_cli.options.preset import Preset, load_preset
 from gsdmsr_cli.raster import best_engine
@@ -47,3 +49,15 @@ def through(trainer: StreamTrainer, moments: int) -> None:
         if trainer.clock.moment == moments - 1:
             return
         trainer.begin_next()
+
+
+def psnr_of(trainer: StreamTrainer) -> float:
+    """Return the mean PSNR of the test views of the present moment [dB]."""
+    renderer, found = trainer.renderer, []
+    for view in trainer.scene.split("test"):
+        if view.time == trainer.shot.time:
+            given = renderer.engine, renderer.background
+            rgb = draw(trainer.model, view.camera, view.time, *given).rgb.detach().clamp(0, 1)
+            true = renderer.pictures.load(view).permute(1, 2, 0) / 255
+            found.append(float(-10 * (rgb - true).square().mean().log10()))
+    return fmean(found)

@@ -12,8 +12,8 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from rigs import write_rig
+from stream_checks import psnr_of
 
-from gsdmsr_cli.drawing.splatting import draw
 from gsdmsr_cli.formats import read_scene
 from gsdmsr_cli.options.preset import load_preset
 from gsdmsr_cli.raster import best_engine
@@ -41,11 +41,7 @@ def psnrs(data: Path, way: str, options: list[str]) -> list[float]:
         while trainer.clock.progress < 1:
             trainer.step()
         trainer.settle()
-        (view,) = (v for v in trainer.scene.split("test") if v.time == trainer.shot.time)
-        given = trainer.renderer.engine, trainer.renderer.background
-        rgb = draw(trainer.model, view.camera, view.time, *given).rgb.detach().clamp(0, 1)
-        true = pictures.load(view).permute(1, 2, 0) / 255
-        found.append(float(-10 * (rgb - true).square().mean().log10()))
+        found.append(psnr_of(trainer))
     return found
 
 

@@ -8,9 +8,17 @@ from typing import Any
 import pytest
 import torch
 from rigs import VISITOR, write_rig
-from stream_checks import EACH, FIRST, MOMENTS, NEWCOMERS, preset_of, stream_trainer, through
+from stream_checks import (
+    EACH,
+    FIRST,
+    MOMENTS,
+    NEWCOMERS,
+    preset_of,
+    psnr_of,
+    stream_trainer,
+    through,
+)
 
-from gsdmsr_cli.drawing.splatting import draw
 from gsdmsr_cli.gaussians.splats import NAMES
 from gsdmsr_cli.ground.errors import UsageError
 from gsdmsr_cli.ground.geometry import SH_C0
@@ -33,15 +41,6 @@ def rig(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def newcomers_of(trainer: StreamTrainer) -> Newcomers:
     assert trainer.newcomers is not None
     return trainer.newcomers
-
-
-def psnr_of(trainer: StreamTrainer) -> float:
-    """Of the view that was not trained on, at the present moment [dB]."""
-    (view,) = (v for v in trainer.scene.split("test") if v.time == trainer.shot.time)
-    renderer = trainer.renderer
-    frame = draw(trainer.model, view.camera, view.time, renderer.engine, renderer.background)
-    true = renderer.pictures.load(view).permute(1, 2, 0) / 255
-    return float(-10 * (frame.rgb.detach().clamp(0, 1) - true).square().mean().log10())
 
 
 def test_what_comes_in_is_shown(tmp_path: Path) -> None:
