@@ -30,8 +30,8 @@ class Options:
     """Settings of the residuals and their regulariser.
 
     Attributes:
-        degree: of the polynomials of positions, rotations and scales, 1 or more.
-        harmonics: number of frequencies of their Fourier series, 0 or more.
+        degree: of the polynomials of positions and rotations, 1 or more.
+        harmonics: number of frequencies of their Fourier series, 0 or more; 3 in the paper.
         colour_degree, colour_harmonics: the same of colours; both 0 leave colours as they are.
         period: of the lowest frequency [durations of the capture].
         rate: learning rate of the positions' coefficients at the start and the end [scene bounds];
@@ -42,7 +42,7 @@ class Options:
     """
 
     degree: int = 3
-    harmonics: int = 3
+    harmonics: int = 2
     colour_degree: int = 2
     colour_harmonics: int = 2
     period: float = 1.0
@@ -69,13 +69,12 @@ class DualDomain(Layer):
         terms = options.degree + 2 * options.harmonics
         colour_terms = options.colour_degree + 2 * options.colour_harmonics
         self.log_time_scales, self.time_centres = torch.zeros(count), torch.full((count,), 0.5)
-        self.means, self.quats, self.log_scales = (torch.zeros(count, terms, c) for c in (3, 4, 3))
+        self.means, self.quats = (torch.zeros(count, terms, c) for c in (3, 4))
         parameters = [
             Parameter("log_time_scales", self.log_time_scales, True, options.time_rate),
             Parameter("time_centres", self.time_centres, True, options.time_rate),
             Parameter("means", self.means, True, options.rate),
             Parameter("quats", self.quats, True, "quats"),
-            Parameter("log_scales", self.log_scales, True, "log_scales"),
         ]
         self.colours = torch.zeros(count, colour_terms, 3) if colour_terms else None
         if self.colours is not None:
@@ -94,7 +93,6 @@ class DualDomain(Layer):
             splats,
             means=add_series(splats.means, self.means, basis, self.facts.bound),
             quats=add_series(splats.quats, self.quats, basis),
-            log_scales=add_series(splats.log_scales, self.log_scales, basis),
             sh=sh,
         )
         return replace(moment, splats=moved)
