@@ -63,8 +63,9 @@ def run(
     set_threads(1)  # what is drawn here is little, and a training may want the cores
     if open_run(run_folder).preset.segments.several:
         raise UsageError(
-            f"{run_folder}: has the splats of several segments of time, and a page plays those of "
-            f"one; name a segment, such as {folder_of(run_folder, 0)}"
+            f"{run_folder}: has the splats of several segments of time, and this page plays those "
+            f"of one; name a segment, such as {folder_of(run_folder, 0)}, or export all of them "
+            "with --format html"
         )
     _wait_for_splats(run_folder)
     found, model, _ = open_with_model(run_folder)

@@ -102,10 +102,10 @@ def export(
     exporter = cast(Exporter, plugins.load(__name__, format_.replace("-", "_")))
     common, own = taken_apart(settings)
     whole = getattr(exporter, "WHOLE", False)
-    if not model.steady and (whole or getattr(exporter, "BAKES", False)):
+    if whole and not model.steady:
         raise UsageError(
-            f"--format {format_} holds one set of splats, and this run has those of several "
-            "segments of time; export the runs in its folder segments one by one"
+            f"--format {format_} holds one model, and this run has those of several segments of "
+            "time; export the runs in its folder segments one by one"
         )
     options = _read_options(format_, exporter.Options, settings if whole else own)
     asked = strict.build(Asked, common, f"--format {format_}")

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gsdmsr_cli.gaussians.fading import thin
+from gsdmsr_cli.gaussians.fading import MOST, thin
 from gsdmsr_cli.gaussians.moment import Moment
 from gsdmsr_cli.gaussians.splats import together
 from gsdmsr_cli.model.layer import Instant
@@ -55,6 +55,10 @@ class Joined(Model):
     def steady(self) -> bool:
         """Whether row i is the same splat at all times."""
         return False
+
+    def steadied(self) -> Lasting:
+        """See ``Model.steadied``; as ``at_instants`` has it where two segments count."""
+        return Lasting(self)
 
     def tensors(self) -> dict[str, Tensor]:
         """Return the tensors of all models, by ``name_in``."""
@@ -141,7 +145,9 @@ def _blend(shares: Sequence[tuple[float, Moment]]) -> Moment:
     """Return the rows of several moments, those of each with its share of the optical depth."""
     thinned = []
     for weight, moment in shares:
-        logits = thin(moment.splats.logit_opacities, weight)
+        logits = moment.splats.logit_opacities
+        if weight < 1:
+            logits = thin(logits, weight) if weight > 0 else torch.full_like(logits, -MOST)
         thinned.append(replace(moment.splats, logit_opacities=logits))
     further = (_beside([getattr(m, name) for _, m in shares]) for name in ("axes", "features"))
     return Moment(together(thinned), *further)
@@ -151,3 +157,35 @@ def _beside(tensors: Sequence[Tensor | None]) -> Tensor | None:
     """Return the rows of tensors that all moments have or none."""
     known = [tensor for tensor in tensors if tensor is not None]
     return torch.cat(known) if known else None
+
+
+class Lasting(Model):
+    """All splats of all segments at all times: those of segments that do not count are hidden.
+
+    What layers make of colours after drawing is left out.
+
+    Attributes:
+        joined: the models of the segments.
+        splats: theirs, one segment's after the other's, in the order of ``Joined``.
+    """
+
+    def __init__(self, joined: Joined) -> None:
+        self.joined = joined
+        super().__init__(joined.splats, {})
+
+    def at_instants(
+        self, instants: Sequence[Instant], gradient_mask: Tensor | None = None
+    ) -> list[Moment]:
+        """See ``Joined.at_instants``; splats of other segments stay as at these' nearest ends."""
+        if gradient_mask is not None:
+            raise ValueError("models of segments are trained one by one")
+        return [self._at(instant) for instant in instants]
+
+    def _at(self, instant: Instant) -> Moment:
+        joined = self.joined
+        counting = weights(instant.time, joined.segments)
+        moments = []
+        for i, (segment, model) in enumerate(zip(joined.segments, joined.models, strict=True)):
+            within = replace(instant, time=segment.within(instant.time))
+            moments.append((counting.get(i, 0.0), model.at(within)))
+        return _blend(moments)

@@ -92,6 +92,10 @@ class Model:
         """Whether row i of what is drawn is the same splat at all times."""
         return True
 
+    def steadied(self) -> Model:
+        """Return what is drawn as a model of which row i is the same splat at all times."""
+        return self
+
     @property
     def shades(self) -> bool:
         """Whether a layer makes colours anew from what has been drawn."""

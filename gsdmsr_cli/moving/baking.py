@@ -53,6 +53,7 @@ def bake(model: Model, frames: int, least_opacity: float = ALPHA_MIN) -> Baked:
     Raises:
         DataError: a splat holds NaN or infinity.
     """
+    model = model.steadied()
     moving = _moving(model)
     count = min(max(frames, 2), MOST_TIMES) if moving else 1
     times = [i / max(count - 1, 1) for i in range(count)]

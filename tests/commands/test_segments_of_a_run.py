@@ -115,14 +115,21 @@ def test_a_segment_is_a_run_like_any_other(run: Path, gsdmsr: Gsdmsr) -> None:
     assert gsdmsr("export", one, "--format", "html", "--out", one / "page.html") == 0
 
 
-def test_its_splats_are_exported_moment_by_moment_and_not_as_one_set(
-    run: Path, gsdmsr: Gsdmsr, capsys: pytest.CaptureFixture[str]
+def test_its_splats_are_exported_moment_by_moment_and_as_one_file_that_plays(
+    run: Path, rig: Path, gsdmsr: Gsdmsr, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert gsdmsr("export", run, "--format", "ply", "--time", 0.5, "--out", run / "a.ply") == 0
-    for format_ in ("html", "compact"):
+    file = run.parent / "joined.dsplat"
+    assert gsdmsr("export", run, "--format", "moving", "--out", file) == 0
+    scores = []
+    for one in (run, file):
         capsys.readouterr()
-        assert gsdmsr("export", run, "--format", format_, "--out", run / "page") == 2
-        assert "export the runs in its folder segments one by one" in capsys.readouterr().err
+        assert gsdmsr("eval", one, "--data", rig, "--json") == 0
+        document = json.loads(capsys.readouterr().out)
+        scores.append(document["aggregate"]["psnr"])
+    assert scores[1] == pytest.approx(scores[0], abs=0.15)
+    assert gsdmsr("export", run, "--format", "compact", "--out", run / "packed") == 2
+    assert "export the runs in its folder segments one by one" in capsys.readouterr().err
     assert gsdmsr("view", run) == 2
     assert f"name a segment, such as {folder_of(run, 0)}" in capsys.readouterr().err
 
