@@ -20,6 +20,7 @@ OPTIONS = (
     "splats.count=150", "splats.start=box", "stream.keyframe_every=2", "stream.samples=64",
     "density.start=4", "density.every=4", "density.until=0.8", "density.gradient=1e-7",
     "density.cap=220", "data.background=white", "training.low_resolution_until=0.2",
+    "layers=[{name: exposure}]",
 )  # fmt: skip
 
 
