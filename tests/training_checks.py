@@ -17,7 +17,8 @@ from gsdmsr_cli.formats import read_scene
 from gsdmsr_cli.model.model import Model
 from gsdmsr_cli.options.preset import Preset, load_preset
 from gsdmsr_cli.raster import Engine, best_engine
-from gsdmsr_cli.runs.run import Run, create_run
+from gsdmsr_cli.runs.beginning import create_run
+from gsdmsr_cli.runs.run import Run
 from gsdmsr_cli.scene.pictures import Pictures
 from gsdmsr_cli.training.trainer import Trainer
 

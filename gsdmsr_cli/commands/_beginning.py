@@ -16,9 +16,10 @@ from gsdmsr_cli.ground.locks import sole_writer
 from gsdmsr_cli.options import strict
 from gsdmsr_cli.options.preset import Preset, TrainingOptions, load_preset
 from gsdmsr_cli.runs import moments
+from gsdmsr_cli.runs.beginning import continue_run, create_run, refuse_used
 from gsdmsr_cli.runs.checkpoints import Checkpoint
 from gsdmsr_cli.runs.outputs import OUTPUTS
-from gsdmsr_cli.runs.run import Run, continue_run, create_run, is_run, open_run, refuse_used
+from gsdmsr_cli.runs.run import Run, is_run, open_run
 from gsdmsr_cli.runs.seen_pictures import check_whole
 from gsdmsr_cli.scene.scene import Scene
 from gsdmsr_cli.scene.segments import between

@@ -21,7 +21,8 @@ from gsdmsr_cli.options import strict
 from gsdmsr_cli.options.durations import parse_duration
 from gsdmsr_cli.options.preset import Preset, TrainingOptions
 from gsdmsr_cli.runs import segments as parts
-from gsdmsr_cli.runs.run import Run, continue_run, create_run, is_run, open_run
+from gsdmsr_cli.runs.beginning import continue_run, create_run
+from gsdmsr_cli.runs.run import Run, is_run, open_run
 from gsdmsr_cli.scene.scene import Scene
 from gsdmsr_cli.scene.segments import Segment, cut
 from gsdmsr_cli.training.request import Request

@@ -26,8 +26,9 @@ from gsdmsr_cli.ground.errors import UsageError
 from gsdmsr_cli.ground.files import write_json
 from gsdmsr_cli.ground.locks import one_of_readers, sole_writer
 from gsdmsr_cli.options.preset import Preset
+from gsdmsr_cli.runs.beginning import require_apart
 from gsdmsr_cli.runs.checkpoints import SCHEMA
-from gsdmsr_cli.runs.run import Run, require_apart
+from gsdmsr_cli.runs.run import Run
 from gsdmsr_cli.scene.scene import Scene
 from gsdmsr_cli.training.loop import Report, train
 from gsdmsr_cli.training.request import Request

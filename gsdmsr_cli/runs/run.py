@@ -27,14 +27,7 @@ from safetensors import SafetensorError
 
 from gsdmsr_cli import __version__
 from gsdmsr_cli.ground.errors import DataError, GsdmsrError, UsageError
-from gsdmsr_cli.ground.files import (
-    can_be_written,
-    leftovers,
-    nearest_there,
-    read_json,
-    remove_leftovers,
-    write_json,
-)
+from gsdmsr_cli.ground.files import read_json, write_json
 from gsdmsr_cli.model.building import load_model
 from gsdmsr_cli.model.layer import Facts
 from gsdmsr_cli.model.model import Model
@@ -52,13 +45,18 @@ from gsdmsr_cli.runs import (
     stream,
 )
 from gsdmsr_cli.runs.checkpoints import LAST, SCHEMA, WRONG, Checkpoint
-from gsdmsr_cli.scene.picture_hashes import digest
 from gsdmsr_cli.scene.scene import Scene
 from gsdmsr_cli.scene.segments import between
 
+ABOUT = "run.json"
+"""The file that makes a folder a run."""
+
+_LOG, _TRAINING, _JOB = "metrics.jsonl", "training.json", "torchrun.json"
+
+OWN = _LOG, _TRAINING, _JOB, seen_pictures.PICTURES
+"""Files of a run folder beside its description, its checkpoints and what subfolders hold."""
+
 _READ = 1, SCHEMA
-_ABOUT, _LOG, _TRAINING = "run.json", "metrics.jsonl", "training.json"
-_JOB = "torchrun.json"
 
 
 @dataclass(frozen=True)
@@ -168,7 +166,7 @@ class Run:
 
     def describe(self) -> None:
         """Write what the run is, in place of what was said before."""
-        write_json(self.root / _ABOUT, self.about())
+        write_json(self.root / ABOUT, self.about())
 
     def about(self) -> dict[str, Any]:
         """Return what the run is, as plain JSON."""
@@ -327,77 +325,10 @@ class Run:
 def is_run(root: Path) -> bool:
     """Return whether ``root`` holds a run's description, not just any file of its name."""
     try:
-        about = read_json(root / _ABOUT)
+        about = read_json(root / ABOUT)
     except DataError:
         return False
     return "gsdmsr" in about and "preset" in about and isinstance(about.get("schema"), int)
-
-
-def refuse_used(root: Path, overwrite: bool) -> None:
-    """Raise DataError unless a run may be started in the folder ``root``."""
-    if not root.exists():
-        _require_place(root)
-        return
-    if root.is_dir() and set(root.iterdir()) <= {*leftovers(root)}:
-        return  # it is empty but for what a training that was killed at its start has left
-    if not is_run(root):
-        raise DataError(f"{root}: exists and is not a run folder; choose another --out")
-    if not overwrite:
-        raise DataError(
-            f"{root}: holds a run; continue it with --resume or replace it with --overwrite"
-        )
-
-
-def require_apart(root: Path, scene: Scene) -> None:
-    """Raise DataError if the scene lies in the folder ``root``, which a run would replace."""
-    if scene.root.resolve().is_relative_to(root.resolve()):
-        raise DataError(f"{root}: holds the data {scene.root}; choose another --out")
-
-
-def create_run(
-    root: Path,
-    name: str,
-    preset: Preset,
-    facts: Facts,
-    scene: Scene,
-    overwrite: bool = False,
-    reason: str | None = None,
-    verify: bool = False,
-) -> Run:
-    """Start a run folder; an earlier run there is deleted if ``overwrite`` says so.
-
-    ``reason`` is which preset the data has called for, and why; ``verify`` says whether hashes of
-    whole pictures are wanted beside those of samples.
-
-    Raises:
-        DataError: the folder is in use and ``overwrite`` is not set, or is not a run at all, or
-            holds the scene, or cannot be written.
-    """
-    refuse_used(root, overwrite)
-    require_apart(root, scene)
-    data = scene.root.resolve()
-    if root.exists():
-        _clear(root)
-    run = Run(root, name, preset, facts, data, scene.layout, scene.fingerprint, reason)
-    run = replace(run, pictures=digest(scene.pictures))
-    run.describe()
-    seen_pictures.remember(root, scene, verify)
-    return run
-
-
-def continue_run(run: Run, preset: Preset, scene: Scene) -> Run:
-    """Return the run with other options, and with its scene at another place; both written down.
-
-    ``scene`` is what the run sees of it, see ``Run.part_of``.
-
-    Raises:
-        DataError: the scene is not the run's, or the folder cannot be written.
-    """
-    run.check_part(scene)
-    remove_leftovers(run.root)  # a killed training was writing them
-    continued = replace(run, preset=preset, data=scene.root.resolve())
-    continued.describe()
-    return continued
 
 
 def open_run(root: Path) -> Run:
@@ -406,11 +337,11 @@ def open_run(root: Path) -> Run:
     Raises:
         DataError: the folder is missing or not a run, or its description is damaged.
     """
-    path = root / _ABOUT
+    path = root / ABOUT
     if moving_file.is_moving_file(root):
         path, about = root, moving_file.about(root)
     elif not path.is_file():
-        raise DataError(f"{root}: not a run folder (no {_ABOUT}); give one that train wrote")
+        raise DataError(f"{root}: not a run folder (no {ABOUT}); give one that train wrote")
     else:
         about = read_json(path)
     if about.get("schema") not in _READ:
@@ -454,24 +385,3 @@ def open_with_model(root: Path) -> tuple[Run, Model, Checkpoint]:
         if run != before:
             found = None
     return run, *found
-
-
-def _clear(root: Path) -> None:
-    """Remove what a training wrote into its folder, and nothing else.
-
-    Its description stays until it is replaced: a folder without one would be nobody's.
-    """
-    remove_leftovers(root)
-    moments.rewind(root, 0)
-    segments.remove(root)
-    checkpoints.remove(root)
-    for name in (_LOG, _TRAINING, _JOB, seen_pictures.PICTURES):
-        (root / name).unlink(missing_ok=True)
-
-
-def _require_place(root: Path) -> None:
-    """Raise DataError unless the folder ``root``, which is not there yet, can be made."""
-    nearest = nearest_there(root)
-    if not can_be_written(root):
-        problem = "cannot be written" if nearest.is_dir() else "is a file"
-        raise DataError(f"{root}: cannot be made, since {nearest} {problem}; choose another --out")

@@ -27,7 +27,8 @@ from gsdmsr_cli.ground import files, locks
 from gsdmsr_cli.ground.errors import DataError, UsageError
 from gsdmsr_cli.options.preset import load_preset
 from gsdmsr_cli.runs import checkpoints
-from gsdmsr_cli.runs.run import Run, continue_run, create_run, open_run, refuse_used
+from gsdmsr_cli.runs.beginning import continue_run, create_run, refuse_used
+from gsdmsr_cli.runs.run import Run, open_run
 from gsdmsr_cli.scene import imaging
 
 Gsdmsr = Callable[..., int]

@@ -40,8 +40,9 @@ from gsdmsr_cli.moving.quick import quick_file
 from gsdmsr_cli.options.preset import load_preset
 from gsdmsr_cli.paths import _keyframes
 from gsdmsr_cli.runs import moving_file
+from gsdmsr_cli.runs.beginning import create_run
 from gsdmsr_cli.runs.checkpoints import Checkpoint
-from gsdmsr_cli.runs.run import create_run, open_run
+from gsdmsr_cli.runs.run import open_run
 from gsdmsr_cli.scene import imaging
 from gsdmsr_cli.scene.native import cv2
 from gsdmsr_cli.scene.picture_files import IN_CAPTURES

@@ -17,8 +17,9 @@ from gsdmsr_cli.ground.errors import DataError
 from gsdmsr_cli.model.layer import Facts
 from gsdmsr_cli.options.preset import load_preset
 from gsdmsr_cli.runs import checkpoints
+from gsdmsr_cli.runs.beginning import continue_run, create_run
 from gsdmsr_cli.runs.checkpoints import Checkpoint
-from gsdmsr_cli.runs.run import Run, continue_run, create_run, is_run, open_run
+from gsdmsr_cli.runs.run import Run, is_run, open_run
 from gsdmsr_cli.scene.scene import Scene
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="processes cannot be forked here")

@@ -23,8 +23,9 @@ from gsdmsr_cli.model.building import start_model
 from gsdmsr_cli.model.layer import Facts
 from gsdmsr_cli.options.preset import Preset, load_preset
 from gsdmsr_cli.runs import checkpoints, earlier
+from gsdmsr_cli.runs.beginning import continue_run, create_run, refuse_used
 from gsdmsr_cli.runs.checkpoints import Checkpoint
-from gsdmsr_cli.runs.run import Run, continue_run, create_run, open_run, refuse_used
+from gsdmsr_cli.runs.run import Run, open_run
 from gsdmsr_cli.runs.seen_pictures import PICTURES, remember
 from gsdmsr_cli.scene.scene import Scene
 
