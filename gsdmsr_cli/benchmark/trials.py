@@ -16,7 +16,7 @@ from typing import Any
 from gsdmsr_cli.calling.calls import Line, call, call_side_by_side
 from gsdmsr_cli.evaluation.lpips import weights_hashes
 from gsdmsr_cli.formats import read_scene
-from gsdmsr_cli.ground.errors import DataError
+from gsdmsr_cli.ground.errors import DataError, UsageError
 from gsdmsr_cli.ground.files import read_json
 from gsdmsr_cli.ground.limits import cores
 from gsdmsr_cli.options.preset import Preset, load_preset
@@ -37,6 +37,7 @@ class Terms:
         jobs: how many run side by side.
         cpu_threads: of each, None for its share of the cores.
         workers: of Ray, see ``on_ray.connected``; None runs trials here.
+        overrides: options that all trainings have, as ``--set`` takes them.
     """
 
     downscale: int
@@ -46,6 +47,7 @@ class Terms:
     jobs: int = 1
     cpu_threads: int | None = None
     workers: str | None = None
+    overrides: tuple[str, ...] = ()
 
     @property
     def threads(self) -> int | None:
@@ -99,9 +101,13 @@ class Trial:
         return folder.with_name(f"{folder.name}.log")
 
     def overrides(self, terms: Terms) -> list[str]:
-        """Return what differs from the preset, as ``--set`` takes it."""
+        """Return what differs from the preset, as ``--set`` takes it.
+
+        Raises:
+            UsageError: an option that all have is one that the trial or the terms have already.
+        """
         timed = isinstance(self.length, str)
-        return [
+        own = [
             f"training.budget={json.dumps(self.length) if timed else 'null'}",
             *([] if timed else [f"training.steps={self.length}"]),
             f"training.seed={self.seed}",
@@ -109,6 +115,12 @@ class Trial:
             f"data.background={terms.background}",
             *([f"training.threads={terms.threads}"] if terms.threads else []),
         ]
+        given = {override.partition("=")[0] for override in own} | {"training.steps"}
+        for override in terms.overrides:
+            key = override.partition("=")[0]
+            if key in given:
+                raise UsageError(f"--set {override}: trials have a {key} already; drop it")
+        return [*own, *terms.overrides]
 
 
 def all_trials(

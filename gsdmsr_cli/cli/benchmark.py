@@ -76,6 +76,10 @@ def scenes(
             metavar="ray://HOST:PORT|auto|N", help="Run trials on a cluster of Ray; needs ray."
         ),
     ] = None,
+    overrides: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="a.b=v", help="One option of all trainings; repeatable."),
+    ] = None,
 ) -> None:
     """Train presets on scenes at equal lengths and print the table of their scores."""
     lengths: list[str | int] = [*(budget or []), *(steps or [])]
@@ -86,7 +90,8 @@ def scenes(
 
     if workers is not None and jobs > 1:
         raise UsageError("--jobs and --workers are both given; drop one")
-    terms = Terms(downscale, background, split, lpips_weights, jobs, threads, workers)
+    given = downscale, background, split, lpips_weights, jobs, threads, workers
+    terms = Terms(*given, tuple(overrides or []))
     presets: list[str | Path] = [*(preset or []), *(config or [])]
     command.run(folders, out, presets or ["dnerf"], lengths, seed or [0], terms)
 

@@ -105,6 +105,7 @@ def _document(rows: Sequence[dict[str, Any]], terms: Terms) -> dict[str, Any]:
         "downscale": terms.downscale,
         "background": terms.background,
         "threads": terms.threads,
+        "overrides": list(terms.overrides),
     }
     return {"schema": SCHEMA, "protocol": about, "rows": list(rows)}
 
@@ -123,7 +124,7 @@ def _table(rows: Sequence[dict[str, Any]], terms: Terms) -> Table:
         about += f", {terms.threads} CPUs each on workers of Ray"
     elif terms.threads:
         about += f", {terms.threads} of {cores()} cores each"
-    table = Table(title=about)
+    table = Table(title=", ".join([about, *terms.overrides]))
     for place, name in enumerate(HEADS):
         table.add_column(name, justify="left" if place < TEXTS else "right")
     for row in rows:

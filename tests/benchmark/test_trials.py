@@ -93,6 +93,19 @@ def test_a_trial_has_its_own_length_and_seed(
     assert (preset.data.downscale, preset.data.background) == (2, "black")
 
 
+def test_all_trials_may_have_an_option_of_their_own() -> None:
+    terms = Terms(1, "white", "test", None, overrides=("splats.count=9",))
+    assert Trial(Path("s"), "dnerf", 7, 0).options(terms).splats.count == 9
+
+
+@pytest.mark.parametrize("option", ["training.steps=9", "training.seed=1", "data.downscale=2"])
+def test_an_option_that_the_terms_have_is_refused(option: str) -> None:
+    terms = Terms(1, "white", "test", None, overrides=(option,))
+    key = option.partition("=")[0]
+    with pytest.raises(UsageError, match=f"--set {option}: trials have a {key} already"):
+        Trial(Path("s"), "dnerf", "2m", 0).options(terms)
+
+
 def test_a_length_that_does_not_exist_is_refused() -> None:
     with pytest.raises(UsageError, match="budget"):
         load_preset("dnerf", None, Trial(Path("s"), "dnerf", "8", 0).overrides(TERMS))

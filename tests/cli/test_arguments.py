@@ -152,7 +152,7 @@ Gsdmsr = Any  # the fixture of conftest.py
         (
             "benchmark scenes a b --out o --preset static --preset dnerf --budget 2m --budget 8m"
             " --seed 1 --seed 2 --downscale 2 --background black --split val --lpips-weights w"
-            " --jobs 2 --threads 1 --json",
+            " --jobs 2 --threads 1 --set splats.count=9 --json",
             "benchmark_scenes",
             (
                 [Path("a"), Path("b")],
@@ -160,7 +160,7 @@ Gsdmsr = Any  # the fixture of conftest.py
                 ["static", "dnerf"],
                 ["2m", "8m"],
                 [1, 2],
-                Terms(2, "black", "val", Path("w"), 2, 1),
+                Terms(2, "black", "val", Path("w"), 2, 1, overrides=("splats.count=9",)),
             ),
         ),
         (
