@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 from datasets import write_picture
 from numpy.typing import NDArray
-from room import FOCAL, SIZE, WALLS, look_at, looked_up, pattern
+from room import FOCAL, SIZE, WALLS, look_at, on_cube, out_of_room, pattern
 from walking_capture import DIMMED, OFF_PATH, Capture, exposure_drift, opengl_pose, pose_errors
 
 from gsdmsr_cli.model.layers.cameras import corrected
@@ -33,9 +33,6 @@ TARGET = np.array([0.0, 1.4, -0.1])
 
 SEEN = np.random.default_rng(0).uniform([-1.5, 0.3, -1.0], [1.5, 2.2, 1.0], (60, 3))
 """Places that all cameras see, by which their errors are told [m]."""
-
-MOST = 2**14
-"""Lookups at once, of which OpenCV bounds the number."""
 
 
 @dataclass(frozen=True)
@@ -244,24 +241,18 @@ def _shot(camera: Camera, time: float) -> tuple[Floats, NDArray[np.bool_]]:
     v, u = (np.mgrid[: 2 * camera.height, : 2 * camera.width] + 0.5) / 2
     local = [(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)]
     rays = np.stack(local, axis=-1).reshape(-1, 3) @ camera.rotation
-    nearest, points = _out_of_room(camera.centre, rays)
-    colours = _on_cube(points, COARSE_WALLS)
+    nearest, points = out_of_room(camera.centre, rays)
+    colours = on_cube(points, COARSE_WALLS)
     moving = np.zeros(len(rays), bool)
     for thing in THINGS.values():
         far, points = thing.meet(camera.centre, rays, time)
         here = far < nearest
-        colours[here] = _on_cube(points[here], thing.textures)
+        colours[here] = on_cube(points[here], thing.textures)
         moving |= here
         nearest = np.minimum(nearest, far)
     tiles = camera.height, 2, camera.width, 2
     picture = colours.reshape(*tiles, 3).mean((1, 3)) * DIMMED
     return picture, moving.reshape(tiles).any((1, 3))
-
-
-def _out_of_room(origin: Floats, rays: Floats) -> tuple[Floats, Floats]:
-    with np.errstate(divide="ignore", invalid="ignore"):
-        far = ((np.sign(rays) * SIZE - origin) / rays).min(1)
-    return far, (origin + far[:, None] * rays) / SIZE
 
 
 def _into_cube(start: Floats, ways: Floats) -> Floats:
@@ -275,23 +266,6 @@ def _into_ball(start: Floats, ways: Floats) -> Floats:
     root = np.sqrt(b**2 - a * (start @ start - 1))
     entry = (-b - root) / a
     return np.where(entry > 0, entry, np.inf)  # NaN where missed
-
-
-def _on_cube(points: Floats, textures: Sequence[Floats]) -> Floats:
-    """Return the colours (P, 3) of points that are projected from the middle onto a cube."""
-    axis = abs(points).argmax(1)
-    out = np.take_along_axis(points, axis[:, None], 1)
-    unit = (points / abs(out) + 1) / 2
-    colours = np.empty_like(points)
-    for side in range(6):
-        which, ahead = side % 3, side >= 3
-        here = (axis == which) & ((out[:, 0] > 0) == ahead)
-        rows = here.nonzero()[0]
-        for some in np.split(rows, range(MOST, len(rows), MOST)):
-            if len(some):
-                a, b = (unit[some, i][:, None] for i in range(3) if i != which)
-                colours[some] = looked_up(textures[side], a, b)[:, 0]
-    return colours
 
 
 def _write(folder: Path, name: str, picture: Floats, moving: NDArray[np.bool_]) -> str:

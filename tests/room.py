@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,6 +12,9 @@ import numpy as np
 SIZE = np.array([3.0, 2.4, 1.5])  # half edges of the room [m]
 FOCAL = 0.9  # focal length over the width
 TEXELS = 256
+
+MOST = 2**14
+"""Lookups at once, of which OpenCV bounds the number."""
 
 
 @dataclass(frozen=True)
@@ -44,6 +48,30 @@ def looked_up(texture: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
     return cv2.remap(texture.astype(np.float32), map_u, map_v, cv2.INTER_LINEAR)
 
 
+def out_of_room(origin: np.ndarray, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return how far along rays (R, 3) walls are, and their points, in half edges of the room."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        far = ((np.sign(rays) * SIZE - origin) / rays).min(1)
+    return far, (origin + far[:, None] * rays) / SIZE
+
+
+def on_cube(points: np.ndarray, textures: Sequence[np.ndarray]) -> np.ndarray:
+    """Return the colours (P, 3) of points that are projected from the middle onto a cube."""
+    axis = abs(points).argmax(1)
+    out = np.take_along_axis(points, axis[:, None], 1)
+    unit = (points / abs(out) + 1) / 2
+    colours = np.empty_like(points)
+    for side in range(6):
+        which, ahead = side % 3, side >= 3
+        here = (axis == which) & ((out[:, 0] > 0) == ahead)
+        rows = here.nonzero()[0]
+        for some in np.split(rows, range(MOST, len(rows), MOST)):
+            if len(some):
+                a, b = (unit[some, i][:, None] for i in range(3) if i != which)
+                colours[some] = looked_up(textures[side], a, b)[:, 0]
+    return colours
+
+
 def look_at(centre: np.ndarray, target: np.ndarray) -> np.ndarray:
     """Camera-to-world in OpenCV axes (x right, y down, z ahead); the world's z is up."""
     ahead = (target - centre) / np.linalg.norm(target - centre)
@@ -74,18 +102,8 @@ def draw(pose: np.ndarray, width: int, height: int, thing: float = 0.0, phase: f
     local = np.stack([(u - width / 2) / focal, (v - height / 2) / focal, np.ones_like(u)], axis=-1)
     rays = local @ pose[:3, :3].T
     centre = pose[:3, 3]
-    with np.errstate(divide="ignore"):
-        distances = (np.sign(rays) * SIZE - centre) / rays
-    axis = distances.argmin(axis=-1)
-    points = centre + rays * distances.min(axis=-1)[..., None]
-    unit = (points / SIZE + 1) / 2
-    picture = np.zeros((height, width, 3), np.float32)
-    for wall in range(6):
-        side, which = divmod(wall, 3)
-        here = (axis == which) & ((rays[..., which] > 0) == bool(side))
-        a, b = [i for i in range(3) if i != which]
-        drawn = looked_up(WALLS[wall], unit[..., a], unit[..., b])
-        picture[here] = drawn[here]
+    _, points = out_of_room(centre, rays.reshape(-1, 3))
+    picture = on_cube(points, WALLS).reshape(height, width, 3)
     moving = np.zeros((height, width), bool)
     if thing:
         depth = 0.8
