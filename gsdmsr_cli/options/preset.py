@@ -251,7 +251,7 @@ class DensityOptions:
         until: progress at which it ends.
         gradient: mean norm of the screen-space gradient above which a splat grows [1 / NDC unit].
         split_scale: a growing splat is split above this scale and cloned below [scene radii].
-        prune_scale: a splat above this scale is pruned [scene radii].
+        prune_scale: a splat above this scale is pruned as long as splats grow [scene radii].
         prune_opacity: a splat below this opacity is pruned.
         reset_at: progress of each opacity reset.
         reset_opacity: what opacities are lowered to then.

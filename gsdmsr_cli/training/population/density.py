@@ -28,7 +28,7 @@ class Options:
 
 
 class Density(Event):
-    """Clones, splits and prunes; once growing has ended, prunes alone.
+    """Clones, splits and prunes; once growing has ended, prunes what is faint alone.
 
     Attributes:
         rounds: how many times splats have grown.
@@ -115,7 +115,8 @@ def grow_and_prune(
     largest = splats.log_scales.exp().amax(dim=1)
     logits = splats.logit_opacities if highest is None else highest
     kept = torch.sigmoid(logits) >= options.prune_opacity
-    kept &= largest <= options.prune_scale * radius
+    if growing:  # later nothing would take the place of a large splat, which may be a wall
+        kept &= largest <= options.prune_scale * radius
     for tensor in splats.tensors().values():
         kept &= tensor.isfinite().reshape(len(splats), -1).all(dim=1)
     wanted = _chosen(statistics, options, int(kept.sum())) if growing else torch.zeros_like(kept)

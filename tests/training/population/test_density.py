@@ -126,9 +126,15 @@ def test_faint_and_huge_splats_are_pruned_even_if_they_would_grow() -> None:
     splats = splats_of([SMALL, HUGE, LARGE, SMALL])
     splats.logit_opacities[0] = math.log(0.009 / 0.991)
     splats.logit_opacities[3] = math.log(0.011 / 0.989)
-    for growing in (True, False):
-        rows, fresh, _ = grown(splats, [1.0, 1.0, 0.0, 0.0], growing=growing)
-        assert rows == [2, 3] and not any(fresh)
+    rows, fresh, _ = grown(splats, [1.0, 1.0, 0.0, 0.0])
+    assert rows == [2, 3] and not any(fresh)
+
+
+def test_once_growing_has_ended_huge_splats_stay_since_nothing_would_take_their_place() -> None:
+    splats = splats_of([SMALL, HUGE, LARGE, SMALL])
+    splats.logit_opacities[0] = math.log(0.009 / 0.991)
+    rows, fresh, _ = grown(splats, [1.0, 1.0, 0.0, 0.0], growing=False)
+    assert rows == [1, 2, 3] and not any(fresh)
 
 
 def test_without_growing_large_gradients_do_nothing() -> None:
