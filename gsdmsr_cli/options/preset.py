@@ -267,7 +267,7 @@ class DensityOptions:
     until: float = 0.35
     gradient: float = 9e-4
     split_scale: float = 0.01
-    prune_scale: float = 0.1
+    prune_scale: float = 1.0
     prune_opacity: float = 0.005
     reset_at: tuple[float, ...] = (0.12,)
     reset_opacity: float = 0.05
