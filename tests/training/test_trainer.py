@@ -216,6 +216,7 @@ def test_the_motion_starts_without_the_momentum_of_the_static_phase(tiny_scene: 
 
 def test_a_motion_is_anchored_anew_as_it_begins_and_after_every_growth(tiny_scene: Path) -> None:
     options = ["training.static_until=0.25", "density.gradient=1e-9", "density.reset_at=[]"]
+    options += ["density.cap=1000"]  # there is room to grow after it has begun
     trainer = trainer_of(tiny_scene, preset_of(*options, motion="control_points"))
     anchored: list[tuple[int, int]] = []
     reanchor = trainer.model.reanchor
