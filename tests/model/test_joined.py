@@ -104,3 +104,18 @@ def test_layers_see_times_of_their_own_segment(joined: Joined) -> None:
             number = joined.models.index(share.model)
             assert share.instant.time == pytest.approx(SEGMENTS[number].within(time))
             assert share.instant.jitter == 0.25
+
+
+def test_a_steady_model_has_all_splats_and_shows_those_that_count(
+    joined: Joined,
+) -> None:
+    steady = joined.steadied()
+    assert steady.steady and steady.steadied() is steady
+    for time in (0.0, 0.2, *(segment.end for segment in SEGMENTS), 0.95):
+        splats = splats_at(steady, time)
+        assert len(splats) == sum(COUNTS)
+        seen = splats.logit_opacities.sigmoid() > 1e-6
+        assert torch.equal(splats.means[seen], splats_at(joined, time).means)
+        assert torch.allclose(
+            splats.logit_opacities[seen], splats_at(joined, time).logit_opacities, atol=1e-5
+        )
