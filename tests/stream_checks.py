@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 from statistics import fmean
 
@@ -41,15 +42,23 @@ def stream_trainer(data: Path, *options: str, way: str = WAYS[0]) -> StreamTrain
     return StreamTrainer(read_scene(data), preset, best_engine("cpu"), pictures)
 
 
-def through(trainer: StreamTrainer, moments: int) -> None:
-    """Train the present moment and later ones, until so many are over."""
+def each_moment(trainer: StreamTrainer) -> Iterator[int]:
+    """Train the present moment and all later ones, and yield the number of each as it is over."""
     while True:
         while trainer.clock.progress < 1:
             trainer.step()
         trainer.settle()
-        if trainer.clock.moment == moments - 1:
+        yield trainer.clock.moment
+        if trainer.clock.moment == len(trainer.shots) - 1:
             return
         trainer.begin_next()
+
+
+def through(trainer: StreamTrainer, moments: int) -> None:
+    """Train the present moment and later ones, until so many are over."""
+    for moment in each_moment(trainer):
+        if moment == moments - 1:
+            return
 
 
 def psnr_of(trainer: StreamTrainer) -> float:

@@ -20,7 +20,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 import numpy as np
 import torch
 from moving_room import THINGS, Floats, Thing, write_rig
-from stream_checks import psnr_of
+from stream_checks import each_moment, psnr_of
 
 from gsdmsr_cli.formats import read_scene
 from gsdmsr_cli.gaussians.splats import Splats
@@ -82,12 +82,7 @@ def errors(data: Path, way: str, options: Sequence[str], points: dict[str, Float
     held: dict[str, tuple[torch.Tensor, torch.Tensor]] = {}
     found: dict[str, list[Floats]] = {name: [] for name in points}
     psnr, told = [], []
-    for moment in range(len(trainer.shots)):
-        if moment:
-            trainer.begin_next()
-        while trainer.clock.progress < 1:
-            trainer.step()
-        trainer.settle()
+    for moment in each_moment(trainer):
         psnr.append(psnr_of(trainer))
         with torch.no_grad():
             splats = trainer.model.at(trainer.model.instant(trainer.shot.time)).splats

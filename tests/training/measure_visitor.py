@@ -12,7 +12,7 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from rigs import write_rig
-from stream_checks import psnr_of
+from stream_checks import each_moment, psnr_of
 
 from gsdmsr_cli.formats import read_scene
 from gsdmsr_cli.options.preset import load_preset
@@ -34,15 +34,7 @@ def psnrs(data: Path, way: str, options: list[str]) -> list[float]:
     preset = load_preset(way, None, [*OPTIONS, *options])
     pictures = Pictures((1.0, 1.0, 1.0), 1, 1 << 28)
     trainer = StreamTrainer(read_scene(data), preset, best_engine("cpu"), pictures)
-    found = []
-    for moment in range(MOMENTS):
-        if moment:
-            trainer.begin_next()
-        while trainer.clock.progress < 1:
-            trainer.step()
-        trainer.settle()
-        found.append(psnr_of(trainer))
-    return found
+    return [psnr_of(trainer) for _ in each_moment(trainer)]
 
 
 def main() -> None:

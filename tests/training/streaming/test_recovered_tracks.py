@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 from recovery_checks import OPTIONS, WHITE, Case, canonical_splats, moved, scene_of
+from stream_checks import each_moment
 from torch import Tensor
 
 from gsdmsr_cli.options.preset import Preset, load_preset
@@ -60,12 +61,7 @@ def test_splats_are_followed_to_a_hundredth_of_their_paths(
             trainer.model.splats.tensors()[name].copy_(tensor)
     found, before = [], torch.get_num_threads()
     torch.set_num_threads(1)
-    for moment in range(len(trainer.shots)):
-        if moment:
-            trainer.begin_next()
-        while trainer.clock.progress < 1:
-            trainer.step()
-        trainer.settle()
+    for _ in each_moment(trainer):
         found.append(trainer.model.at(trainer.model.instant(trainer.shot.time)).splats.means)
     torch.set_num_threads(before)
     true = torch.stack([path(canonical_splats().means, shot.time) for shot in trainer.shots])
