@@ -56,7 +56,10 @@ Shown = Sequence[tuple[Share, Moment]]
 
 def show(model: Model, instant: Instant) -> Shown:
     """Return what is drawn of a model at an instant."""
-    return [(share, share.model.at(share.instant)) for share in model.shares(instant)]
+    return [
+        (share, share.model.as_seen(share.model.at(share.instant), share.instant))
+        for share in model.shares(instant)
+    ]
 
 
 def draw_shown(

@@ -120,10 +120,10 @@ class Layer(ABC):
         """
         return camera
 
-    def trace(self, moment: Moment, instant: Instant) -> Moment:
-        """Return the moment as it is, whose gradients reach what ``place`` goes by.
+    def as_seen(self, moment: Moment, instant: Instant) -> Moment:
+        """Return the moment as the view ``instant.view`` shows it; the last thing before drawing.
 
-        The last thing before drawing, and in a training alone; ``instant.view`` says of which view.
+        Such as in its colours, or as it is with gradients that reach what ``place`` goes by.
         """
         return moment
 

@@ -147,11 +147,14 @@ class Model:
             camera = layer.place(camera, time)
         return camera
 
-    def trace(self, moment: Moment, instant: Instant) -> Moment:
-        """Return what is drawn, whose gradients reach what layers hold of the view as well."""
+    def as_seen(self, moment: Moment, instant: Instant) -> Moment:
+        """Return what is drawn of the moment: as the view of the capture shows it, if it is one.
+
+        Gradients reach what layers hold of the view as well.
+        """
         if instant.view is not None:
             for layer in self._holding_views():
-                moment = layer.trace(moment, instant)
+                moment = layer.as_seen(moment, instant)
         return moment
 
     def tell_views(self, views: Sequence[tuple[Camera, float]]) -> dict[str, Any]:

@@ -84,8 +84,8 @@ class Cameras(PerView):
             shifts = shifts - (shifts * arms).sum() / squares * arms
         return torch.cat([turns, shifts], dim=1)
 
-    def trace(self, moment: Moment, instant: Instant) -> Moment:
-        """Return the moment, whose gradients reach the correction of the view as well."""
+    def as_seen(self, moment: Moment, instant: Instant) -> Moment:
+        """Return the moment as it is, whose gradients reach the correction of the view as well."""
         if not self.learning or not torch.is_grad_enabled() or instant.view is None:
             return moment
         own = self.weighed(self.values, instant.view, instant.time)

@@ -140,7 +140,7 @@ class TrainingRenderer:
         moments = self._moved(model, [i for look in looks for i in look.instants], phase)
         found = compare_views(
             self.engine, model,
-            [model.trace(moments[look.instant], look.instant) for look in looks],
+            [model.as_seen(moments[look.instant], look.instant) for look in looks],
             [look.camera for look in looks], self.background, [look.target for look in looks],
             self._ssim_weight(phase.progress), self._sh_degree(phase.progress),
             [self._on_device(look.order.tile_weights) for look in looks],
@@ -155,7 +155,7 @@ class TrainingRenderer:
         moments = self._moved(model, look.instants, phase)
         moment = moments[look.instant]
         found = compare(
-            self.engine, model, model.trace(moment, look.instant), look.instant, look.camera,
+            self.engine, model, model.as_seen(moment, look.instant), look.instant, look.camera,
             self.background, look.target, self._ssim_weight(phase.progress),
             self._sh_degree(phase.progress), self._on_device(look.order.tile_weights), look.mask,
             self.preset.losses.inliers, phase.screens, self._further(model, look, moments, phase),

@@ -55,9 +55,9 @@ def moment_of(degree: int, with_axes: bool, dtype: torch.dtype = torch.float64) 
 
 def loss_of(layer: Cameras, moment: Moment, weights: Tensor, engine: str = "reference") -> Tensor:
     camera, time = VIEWS[2]
-    traced = layer.trace(moment, Instant(time, view=camera))
+    seen = layer.as_seen(moment, Instant(time, view=camera))
     frame = load_engine(engine).rasterize(
-        traced, layer.place(camera, time), torch.ones(3, dtype=weights.dtype)
+        seen, layer.place(camera, time), torch.ones(3, dtype=weights.dtype)
     )
     return (frame.rgb * weights).sum()
 
@@ -109,13 +109,13 @@ def test_the_engine_of_the_cpu_gives_the_same(with_axes: bool) -> None:
 def test_what_is_drawn_and_its_other_gradients_stay() -> None:
     layer, moment, weights = layer_of(), moment_of(1, False), weights_of()
     camera, time = VIEWS[2]
-    traced = layer.trace(moment, Instant(time, view=camera))
+    seen = layer.as_seen(moment, Instant(time, view=camera))
     for name, tensor in moment.tensors().items():
-        assert torch.equal(traced.tensors()[name], tensor)
+        assert torch.equal(seen.tensors()[name], tensor)
     own = [*moment.splats.tensors().values()]
     found = torch.autograd.grad(loss_of(layer, moment, weights), own)
     layer.advance(0.0)
-    assert layer.trace(moment, Instant(time, view=camera)) is moment
+    assert layer.as_seen(moment, Instant(time, view=camera)) is moment
     expected = torch.autograd.grad(loss_of(layer, moment, weights), own)
     for one, other in zip(found, expected, strict=True):
         assert torch.equal(one, other)
@@ -147,7 +147,7 @@ def test_what_all_cameras_do_together_is_left_to_the_splats() -> None:
 def test_free_cameras_and_strange_views_have_none() -> None:
     layer, moment = layer_of(), moment_of(0, False)
     camera, _ = VIEWS[2]
-    assert layer.trace(moment, Instant(0.5)) is moment
+    assert layer.as_seen(moment, Instant(0.5)) is moment
     far = replace(camera, world_to_camera=look_at(np.array([-3.0, 0.0, 1.0]), np.zeros(3), UP))
     assert layer.place(far, 0.5) is far
 
