@@ -21,7 +21,6 @@ from gsdmsr_cli.ground.errors import DataError, UsageError
 from gsdmsr_cli.options.preset import BACKGROUNDS
 from gsdmsr_cli.player.page import page
 from gsdmsr_cli.runs.run import Run, open_run, open_with_model
-from gsdmsr_cli.runs.segments import folder_of
 from gsdmsr_cli.scene.pictures import Pictures
 from gsdmsr_cli.scene.scene import Scene
 from gsdmsr_cli.training.loop import validation_view
@@ -61,13 +60,8 @@ def run(
     """
     torch.set_num_threads(1)
     set_threads(1)  # what is drawn here is little, and a training may want the cores
-    if open_run(run_folder).preset.segments.several:
-        raise UsageError(
-            f"{run_folder}: has the splats of several segments of time, and this page plays those "
-            f"of one; name a segment, such as {folder_of(run_folder, 0)}, or export all of them "
-            "with --format html"
-        )
-    _wait_for_splats(run_folder)
+    if not open_run(run_folder).preset.segments.several:  # of these all have to be there
+        _wait_for_splats(run_folder)
     found, model, _ = open_with_model(run_folder)
     if model.needs_camera:
         raise UsageError(f"{run_folder}: its splats depend on the camera, which a page cannot play")

@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from gsdmsr_cli.model.joined import Joined
 from gsdmsr_cli.model.model import Model
 from gsdmsr_cli.moving.baking import bake
 from gsdmsr_cli.moving.coding import coded, described, steps_named
 from gsdmsr_cli.moving.container import to_bytes
 
 MOST_TIMES = 33
-"""At which a model is looked at."""
+"""At which a model is looked at, or that of each segment of time."""
 
 
 def quick_file(model: Model, frames: int, bound: float, further: Mapping[str, Any]) -> bytes:
@@ -26,6 +27,7 @@ def quick_file(model: Model, frames: int, bound: float, further: Mapping[str, An
     Raises:
         DataError: a splat holds NaN or infinity.
     """
-    baked = bake(model, min(frames, MOST_TIMES))
+    segments = len(model.segments) if isinstance(model, Joined) else 1
+    baked = bake(model, min(frames, MOST_TIMES * segments))
     parts = coded(baked, steps_named(baked), bound)
     return to_bytes({**described(baked), **further}, parts)

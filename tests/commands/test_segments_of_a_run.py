@@ -11,17 +11,22 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 import torch
 from rigs import write_rig
+from served_pages import get, view
 
 from gsdmsr_cli.commands import _segments
 from gsdmsr_cli.drawing.splatting import draw
 from gsdmsr_cli.formats import read_scene
 from gsdmsr_cli.model.joined import Joined
+from gsdmsr_cli.moving.container import from_bytes
 from gsdmsr_cli.raster import best_engine
 from gsdmsr_cli.runs.run import open_run, open_with_model
 from gsdmsr_cli.runs.segments import folder_of, static_of
+from gsdmsr_cli.training.loop import validation_view
 
 Gsdmsr = Callable[..., int]
 
@@ -130,8 +135,23 @@ def test_its_splats_are_exported_moment_by_moment_and_as_one_file_that_plays(
     assert scores[1] == pytest.approx(scores[0], abs=0.15)
     assert gsdmsr("export", run, "--format", "compact", "--out", run / "packed") == 2
     assert "export the runs in its folder segments one by one" in capsys.readouterr().err
-    assert gsdmsr("view", run) == 2
-    assert f"name a segment, such as {folder_of(run, 0)}" in capsys.readouterr().err
+
+
+def test_all_of_them_are_looked_at_together(
+    run: Path, rig: Path, gsdmsr: Gsdmsr, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with view(run) as address:
+        header, _ = from_bytes(get(address, "scene.dsplat"))
+        own = [len(open_run(folder_of(run, i)).load_model()[0].splats) for i in (0, 1)]
+        assert max(own) < header["splats"] <= sum(own)
+        shown = cv2.imdecode(np.frombuffer(get(address, "drawn.png"), np.uint8), -1)[..., ::-1]
+    held_out, (_, model, _) = validation_view(read_scene(rig)), open_with_model(run)
+    white = torch.ones(3)
+    drawn = draw(model, held_out.camera, held_out.time, best_engine("cpu"), white).rgb.numpy()
+    assert np.abs(shown / 255 - drawn.clip(0, 1)).mean() < 0.01 < np.abs(1 - drawn).mean() / 5
+    open_run(run).checkpoint_path.unlink()
+    assert gsdmsr("view", run) == 3
+    assert "not all of its 2 segments are trained" in capsys.readouterr().err
 
 
 def test_side_by_side_they_become_the_same(

@@ -4,13 +4,9 @@ from __future__ import annotations
 
 import json
 import os
-import signal
 import subprocess
 import sys
 import time
-import urllib.request
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -19,6 +15,7 @@ from urllib.error import HTTPError
 import cv2
 import numpy as np
 import pytest
+from served_pages import get, view
 from training_checks import begun_run
 
 from gsdmsr_cli.moving.container import from_bytes
@@ -35,25 +32,6 @@ def run(tiny_scene: Path, tmp_path: Path) -> Path:
     run.log({"step": 5, "elapsed": 60.0, "progress": 0.25, "splats": 200, "val_psnr": 20.5})
     run.log({"step": 9, "elapsed": 120.0, "progress": 0.5, "splats": 200, "val_psnr": 21.5})
     return run.root
-
-
-@contextmanager
-def view(*words: object) -> Iterator[str]:
-    """Run the command, yield the address that it says, and end it as Ctrl-C would."""
-    line = [sys.executable, "-m", "gsdmsr_cli", "view", *map(str, words), "--json"]
-    with subprocess.Popen(line, stdout=subprocess.PIPE, text=True) as process:
-        assert process.stdout is not None
-        try:
-            yield json.loads(process.stdout.readline())["address"]
-        finally:
-            process.send_signal(signal.SIGINT)
-            assert process.wait(30) == 0
-
-
-def get(address: str, name: str = "") -> bytes:
-    with urllib.request.urlopen(address + name, timeout=30) as answer:
-        found: bytes = answer.read()
-        return found
 
 
 def test_a_run_is_served(run: Path) -> None:
