@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -252,6 +253,8 @@ def test_a_report_of_a_moment_that_is_over_tells_its_time_and_bytes() -> None:
     assert over.place == "moment 2 of 10 in 8.0 s, 12,345 bytes  " and over.always_told
     assert over.remaining == 8 * 8.0
     assert over.entry()["bytes"] == 12345 and over.entry()["moment_s"] == 8.0
+    first = replace(over, moment=0, seconds=60.0)
+    assert first.remaining == 240.0, "later moments are not as long as the first"
 
 
 def test_the_page_of_a_stream_plays_the_moments_that_are_over(run: Path) -> None:

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from gsdmsr_cli.options.durations import parse_duration
-from gsdmsr_cli.options.preset import Preset
+from gsdmsr_cli.options.preset import Preset, TrainingOptions
+from gsdmsr_cli.options.sequences import StreamOptions
 from gsdmsr_cli.training.schedule import Clock
 
 
@@ -20,12 +21,14 @@ class StreamClock(Clock):
         moment: the present one, from 0.
         first_step: steps that had been made as it began.
         first_elapsed: wall time of training until then [s].
+        first_length: of the first moment, in lengths of a later one.
     """
 
     moments: int = 1
     moment: int = 0
     first_step: int = 0
     first_elapsed: float = 0.0
+    first_length: float = 1.0
 
     @property
     def progress(self) -> float:
@@ -41,8 +44,11 @@ class StreamClock(Clock):
 
     @property
     def overall(self) -> float:
-        """How far all moments are, in [0, 1]."""
-        return min((self.moment + self.progress) / self.moments, 1.0)
+        """How far all moments are, in [0, 1], as a share of their time or steps."""
+        of_first = self.progress if self.moment == 0 else 1.0
+        later = self.moment - 1 + self.progress if self.moment else 0.0
+        total = self.first_length + self.moments - 1
+        return min((of_first * self.first_length + later) / total, 1.0)
 
     def begin(self, moment: int, preset: Preset) -> None:
         """Let a moment begin now, of the length that the preset gives it."""
@@ -50,10 +56,17 @@ class StreamClock(Clock):
         self.measure(preset)
 
     def measure(self, preset: Preset) -> None:
-        """Take the length of the present moment from the preset."""
-        length = preset.stream if self.moment else preset.training
-        self.steps = length.steps
-        self.budget = None if length.budget is None else parse_duration(length.budget)
+        """Take the length of the present moment from the preset.
+
+        Where of the first and the later ones one has steps and the other a time, nothing is known
+        of how much longer the first is.
+        """
+        first, later = _length(preset.training), _length(preset.stream)
+        self.steps, self.budget = later if self.moment else first
+        if first[1] is not None and later[1] is not None:
+            self.first_length = first[1] / later[1]
+        elif first[1] is None and later[1] is None:
+            self.first_length = first[0] / later[0]
 
     def state(self) -> dict[str, Any]:
         """Return what a resumed training needs beside the steps and the time.
@@ -67,3 +80,8 @@ class StreamClock(Clock):
         """Return to what ``state`` returned."""
         self.moment, self.first_step = int(state["moment"]), int(state["first_step"])
         self.first_elapsed = float(state.get("first_elapsed", self.before))
+
+
+def _length(options: TrainingOptions | StreamOptions) -> tuple[int, float | None]:
+    """Return steps, and wall time [s] where there is a budget."""
+    return options.steps, None if options.budget is None else parse_duration(options.budget)

@@ -44,8 +44,8 @@ class MomentReport(Report):
 
     @property
     def remaining(self) -> float:
-        """Wall time that is left if all further moments take as long as this one [s]."""
-        if self.bytes is None:
+        """Wall time that is left if all further moments take as long as a whole later one [s]."""
+        if self.bytes is None or not self.moment:
             return super().remaining
         return self.seconds * (self.moments - 1 - self.moment)
 
