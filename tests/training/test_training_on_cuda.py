@@ -249,7 +249,8 @@ def test_camera_sizes_decide_whether_views_go_together(tiny_scene: Path) -> None
         ("training.views_per_step=null", 8),
         ("training.views_per_step=5", 5),
         ("losses.terms=[{name: temporal_smoothness}]", 2),
-        ("layers=[{name: exposure}]", 2),
+        ("layers=[{name: exposure}]", 8),
+        ("layers=[{name: decoder}]", 2),
         ("losses.inliers=0.9", 2),
     ],
 )

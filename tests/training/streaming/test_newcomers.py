@@ -22,6 +22,7 @@ from stream_checks import (
 from gsdmsr_cli.gaussians.splats import NAMES
 from gsdmsr_cli.ground.errors import UsageError
 from gsdmsr_cli.ground.geometry import SH_C0
+from gsdmsr_cli.model.layers.exposure import Exposure
 from gsdmsr_cli.model.layers.newcomers import BEGIN, FADED, OWN, Newcomers
 from gsdmsr_cli.ops.spread import spacing
 from gsdmsr_cli.training.streaming import trainer as streaming
@@ -41,6 +42,21 @@ def rig(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def newcomers_of(trainer: StreamTrainer) -> Newcomers:
     assert trainer.newcomers is not None
     return trainer.newcomers
+
+
+def test_they_have_the_exposure_of_a_camera_like_all_splats(rig: Path) -> None:
+    trainer = stream_trainer(rig, NEWCOMERS)
+    through(trainer, 2)
+    layer, view = trainer.model.layers["layers.exposure"], trainer.views[trainer.shot.rows[0]]
+    assert isinstance(layer, Exposure)
+    with torch.no_grad():
+        layer.values[0, :, 3] += 0.2  # of which the mean over six cameras is taken away
+    instant, _ = trainer.model.instant_of_view(view.time, view.camera)
+    plain = trainer.model.at(instant)
+    seen = trainer.model.as_seen(plain, instant).splats.sh[:, 0] - plain.splats.sh[:, 0]
+    assert trainer.model.moving == len(plain) and len(newcomers_of(trainer)) == COUNT
+    torch.testing.assert_close(seen[-COUNT:], seen[:1].expand(COUNT, 3), rtol=0.2, atol=0.02)
+    assert seen.min() > 0.15 / SH_C0 * 5 / 6
 
 
 def test_what_comes_in_is_shown(tmp_path: Path) -> None:
