@@ -272,7 +272,7 @@ class Trainer:
 
     def _order(self, row: int, progress: float) -> Order:
         view, weights, jitter = self.views[row], None, 0.0
-        tiles = self.renderer.tiles(view, progress)
+        tiles = self.renderer.tiles(view, progress, self.frozen)
         if 0 < self.tiles.count < tiles:
             weights = self.tiles.choose(row, tiles, self.generator)
         if self.model.needs_jitter:

@@ -142,7 +142,7 @@ class TrainingRenderer:
             self.engine, model,
             [model.as_seen(moments[look.instant], look.instant) for look in looks],
             [look.camera for look in looks], self.background, [look.target for look in looks],
-            self._ssim_weight(phase.progress), self._sh_degree(phase.progress),
+            self._ssim_weight(phase.progress, phase.frozen), self._sh_degree(phase.progress),
             [self._on_device(look.order.tile_weights) for look in looks],
             [self._further(model, look, moments, phase) for look in looks],
         )  # fmt: skip
@@ -156,7 +156,7 @@ class TrainingRenderer:
         moment = moments[look.instant]
         found = compare(
             self.engine, model, model.as_seen(moment, look.instant), look.instant, look.camera,
-            self.background, look.target, self._ssim_weight(phase.progress),
+            self.background, look.target, self._ssim_weight(phase.progress, phase.frozen),
             self._sh_degree(phase.progress), self._on_device(look.order.tile_weights), look.mask,
             self.preset.losses.inliers, phase.screens, self._further(model, look, moments, phase),
         )  # fmt: skip
@@ -221,9 +221,12 @@ class TrainingRenderer:
     def _on_device(self, tile_weights: Tensor | None) -> Tensor | None:
         return None if tile_weights is None else tile_weights.to(self.background.device)
 
-    def tiles(self, view: View, progress: float) -> int:
-        """Return how many tiles a view's picture has, or 0 where they may not be chosen."""
-        if self._ssim_weight(progress) > 0:
+    def tiles(self, view: View, progress: float, frozen: bool = False) -> int:
+        """Return how many tiles a view's picture has, or 0 where they may not be chosen.
+
+        ``frozen`` is as in ``Phase``.
+        """
+        if self._ssim_weight(progress, frozen) > 0:
             return 0
         camera = self.camera(view, progress)
         return math.prod(tile_grid(camera.width, camera.height))
@@ -238,8 +241,10 @@ class TrainingRenderer:
         self._halved.release()
         return self.pictures
 
-    def _ssim_weight(self, progress: float) -> float:
+    def _ssim_weight(self, progress: float, frozen: bool) -> float:
         losses = self.preset.losses
+        if frozen:
+            return self.preset.stream.ssim
         return losses.ssim if progress < losses.ssim_until else 0.0
 
     def _sh_degree(self, progress: float) -> int:

@@ -12,7 +12,9 @@ from stream_checks import EACH, FIRST, MOMENTS, NEWCOMERS, WAYS, preset_of, stre
 from training_checks import assert_same_tensors, copies, run_of
 
 from gsdmsr_cli.backends.cpu import jit
-from gsdmsr_cli.training.gradients.phase import Order
+from gsdmsr_cli.drawing.splatting import draw
+from gsdmsr_cli.ops.photometric import photometric_loss
+from gsdmsr_cli.training.gradients.phase import Order, Phase
 from gsdmsr_cli.training.losses import Seen
 from gsdmsr_cli.training.losses.inverse_depth import InverseDepth
 from gsdmsr_cli.training.streaming import trainer as module
@@ -72,6 +74,34 @@ def test_terms_of_canonical_splats_count_at_the_first_moment_alone(
     assert not trainer.frozen
     through(trainer, 2)
     assert trainer.frozen and asked == [trainer.shots[0].time] * 2 * FIRST
+
+
+@pytest.mark.parametrize("weight", [0.0, 0.3])
+def test_ssim_has_a_weight_of_its_own_after_the_first_moment(rig: Path, weight: float) -> None:
+    options = "losses.ssim=0.5", "losses.ssim_until=1", "losses.terms=[]", f"stream.ssim={weight}"
+    trainer = stream_trainer(rig, *options)
+
+    def told() -> float:
+        """Return the loss of the first view of the moment, drawn in full."""
+        phase = Phase(0.9, trainer.population.moving, frozen=trainer.frozen)
+        own = trainer.renderer.gradients(trainer.model, [Order(trainer.shot.rows[0])], phase)
+        return float(own[0].loss)
+
+    def expected(of_ssim: float) -> float:
+        view, pictures = trainer.views[trainer.shot.rows[0]], trainer.renderer.pictures
+        with torch.no_grad():
+            frame = draw(
+                trainer.model, pictures.camera(view), view.time, trainer.renderer.engine,
+                trainer.renderer.background, of_capture=True,
+            )  # fmt: skip
+            return float(photometric_loss(frame.rgb, pictures.load(view), of_ssim))
+
+    through(trainer, 1)
+    assert told() == pytest.approx(expected(0.5), rel=1e-4)
+    trainer.begin_next()
+    trainer.step()
+    assert told() == pytest.approx(expected(weight), rel=1e-4)
+    assert expected(0.5) > 1.2 * expected(0.3) > 1.2 * expected(0.0)
 
 
 @every_way
@@ -201,13 +231,14 @@ def test_a_stream_that_is_resumed_ends_as_one_that_was_not(
 
 
 def test_progress_is_that_of_the_moment_and_of_all(trainer: StreamTrainer) -> None:
-    clock = trainer.clock
+    """Of all it is a share of the steps: the first moment has as many as three later ones."""
+    clock, first = trainer.clock, FIRST / (FIRST + EACH * (MOMENTS - 1))
     for _ in range(FIRST // 2):
         trainer.step()
-    assert (clock.progress, clock.overall) == (0.5, 0.5 / MOMENTS)
+    assert (clock.progress, clock.overall) == (0.5, 0.5 * first)
     through(trainer, 1)
     trainer.begin_next()
-    assert (clock.progress, clock.overall, clock.step) == (0.0, 1 / MOMENTS, FIRST)
+    assert (clock.progress, clock.overall, clock.step) == (0.0, first, FIRST)
     through(trainer, MOMENTS)
     assert (clock.progress, clock.overall) == (1.0, 1.0)
     assert trainer.checkpoint().progress == 1.0
@@ -220,6 +251,7 @@ def test_a_moment_may_be_given_a_time(rig: Path, monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr(module.StreamClock, "elapsed", property(lambda self: now[0] - 100.0))
     now[0] += 30
     assert clock.progress == 0.5
+    assert clock.overall == pytest.approx(30 / (60 + 10 * (MOMENTS - 1)))
     now[0] += 31
     assert clock.progress == 1.0
     clock.begin(1, preset_of("training.budget=60s", "stream.budget=10s"))
