@@ -40,6 +40,11 @@ class Stage:
         self.moments.append(instant.time)
         return SimpleNamespace(splats=instant.time)
 
+    def as_seen(self, moment: Any, instant: Instant) -> Any:
+        """Be asked of every moment before it is drawn."""
+        assert moment.splats == instant.time
+        return moment
+
     def rasterize(self, moment: Any, camera: Camera, background: Any, *rest: Any) -> str:
         self.now += DRAW_S
         self.drawn.append((moment.splats, camera))
