@@ -82,8 +82,7 @@ class Source:
     def lost_at(self, time: float) -> list[str]:
         """Return what is more to the model at ``time`` in [0, 1] than splats, a phrase for each."""
         lost = self._beside(time, "features")
-        shades = any(one.shades and not one.holds_views for one in self.model.layers.values())
-        return [*lost, "colours that are made after drawing"] if shades else lost
+        return [*lost, "colours that are made after drawing"] if self.model.shades else lost
 
     def _beside(self, time: float, name: str) -> list[str]:
         moment = self.model.at(self.model.instant(time))

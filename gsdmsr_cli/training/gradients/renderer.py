@@ -221,7 +221,7 @@ class TrainingRenderer:
     def _on_device(self, tile_weights: Tensor | None) -> Tensor | None:
         return None if tile_weights is None else tile_weights.to(self.background.device)
 
-    def tiles(self, view: View, progress: float, frozen: bool = False) -> int:
+    def tiles(self, view: View, progress: float, frozen: bool) -> int:
         """Return how many tiles a view's picture has, or 0 where they may not be chosen.
 
         ``frozen`` is as in ``Phase``.
