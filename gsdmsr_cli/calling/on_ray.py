@@ -18,6 +18,10 @@ from gsdmsr_cli.ground.files import write_text
 Needs = dict[str, Any]
 """What a worker must have, as plain values, see ``on_worker.lack``."""
 
+ATTEMPTS = 3
+"""How often a cluster is asked that answers, but begins no connection within Ray's 30 s: its head
+node loads Ray once for each caller, which takes longer where others use its disk and cores."""
+
 
 @contextmanager
 def connected(workers: str) -> Iterator[Any]:
@@ -29,7 +33,7 @@ def connected(workers: str) -> Iterator[Any]:
 
     Raises:
         UsageError: Ray is not installed, or ``workers`` is none of these.
-        DataError: there is no such cluster.
+        DataError: there is no such cluster, or it begins no connection.
     """
     how = _how(workers)
     try:
@@ -39,7 +43,13 @@ def connected(workers: str) -> Iterator[Any]:
             f"--workers needs ray, which cannot be imported ({error}); pip install 'gsdmsr[ray]'"
         ) from error
     try:
-        ray.init(log_to_driver=False, logging_level="error", **how)
+        _connect(ray, how)
+    except ConnectionAbortedError as error:
+        raise DataError(
+            f"--workers {workers}: the cluster answers, but has begun no connection in {ATTEMPTS} "
+            f"attempts ({str(error).splitlines()[-1][:300]}); see whether its head node has cores "
+            "and memory left"
+        ) from error
     except (OSError, RuntimeError, ImportError, ValueError, ray.exceptions.RayError) as error:
         raise DataError(
             f"--workers {workers}: no cluster answers ({str(error).splitlines()[0][:200]}); start "
@@ -50,6 +60,16 @@ def connected(workers: str) -> Iterator[Any]:
         yield ray
     finally:
         ray.shutdown()
+
+
+def _connect(ray: Any, how: dict[str, Any]) -> None:
+    for left in reversed(range(ATTEMPTS)):
+        try:
+            ray.init(log_to_driver=False, logging_level="error", **how)
+            return
+        except ConnectionAbortedError:
+            if not left:
+                raise
 
 
 def _how(workers: str) -> dict[str, Any]:

@@ -171,16 +171,42 @@ def test_without_ray_it_is_told_how_to_get_it(monkeypatch: pytest.MonkeyPatch) -
         connected("auto").__enter__()
 
 
+class RayError(Exception):
+    """As Ray has it: of no class of Python's."""
+
+
+def ray_whose_init(init: Callable[..., None]) -> SimpleNamespace:
+    exceptions = SimpleNamespace(RayError=RayError)
+    return SimpleNamespace(init=init, exceptions=exceptions, shutdown=lambda: None)
+
+
+@pytest.mark.parametrize("failures", [2, 3])
+def test_a_head_node_that_begins_too_slowly_is_asked_again(
+    monkeypatch: pytest.MonkeyPatch, failures: int
+) -> None:
+    asked: list[int] = []
+
+    def init(**_: Any) -> None:
+        asked.append(len(asked))
+        if len(asked) <= failures:
+            # as ray.util.client.worker has it, with what the server has printed
+            raise ConnectionAbortedError("Initialization failure from server:\nTraceback\nslow")
+
+    monkeypatch.setitem(sys.modules, "ray", ray_whose_init(init))
+    if failures == 3:
+        with pytest.raises(DataError, match=r"no connection in 3 attempts \(slow\); see whether"):
+            connected("ray://head:10001").__enter__()
+    else:
+        with connected("ray://head:10001"):
+            assert len(asked) == 3
+
+
 def test_a_cluster_that_asks_for_a_token_is_no_internal_error(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    class RayError(Exception):
-        """As Ray has it: of no class of Python's."""
-
     def init(**_: Any) -> None:
         raise RayError("InvalidAuthToken")
 
-    ray = SimpleNamespace(init=init, exceptions=SimpleNamespace(RayError=RayError))
-    monkeypatch.setitem(sys.modules, "ray", ray)
+    monkeypatch.setitem(sys.modules, "ray", ray_whose_init(init))
     with pytest.raises(DataError, match=r"InvalidAuthToken.*~/\.ray/auth_token.*RAY_AUTH_MODE"):
         connected("auto").__enter__()
