@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 
 from gsdmsr_cli.options.durations import parse_duration
 from gsdmsr_cli.options.preset import TrainingOptions
+from gsdmsr_cli.options.sequences import StreamOptions
 
 
 def log_linear(ends: tuple[float, float], progress: float) -> float:
@@ -69,5 +70,9 @@ class Clock:
 
 def new_clock(options: TrainingOptions) -> Clock:
     """Return the clock of a training that has not begun."""
-    budget = None if options.budget is None else parse_duration(options.budget)
-    return Clock(options.steps, budget, options.progress_power)
+    return Clock(*length_of(options), options.progress_power)
+
+
+def length_of(options: TrainingOptions | StreamOptions) -> tuple[int, float | None]:
+    """Return the length in steps, and as wall time [s] where there is a budget."""
+    return options.steps, None if options.budget is None else parse_duration(options.budget)

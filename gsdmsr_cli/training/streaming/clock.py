@@ -6,10 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from gsdmsr_cli.options.durations import parse_duration
-from gsdmsr_cli.options.preset import Preset, TrainingOptions
-from gsdmsr_cli.options.sequences import StreamOptions
-from gsdmsr_cli.training.schedule import Clock
+from gsdmsr_cli.options.preset import Preset
+from gsdmsr_cli.training.schedule import Clock, length_of
 
 
 @dataclass
@@ -22,6 +20,9 @@ class StreamClock(Clock):
         first_step: steps that had been made as it began.
         first_elapsed: wall time of training until then [s].
         first_length: of the first moment, in lengths of a later one.
+        overrun: by how much the last of the later moments was longer than its steps had been given,
+            since it was settled and written as well [s]. The next is given that much less, so that
+            each takes its budget in all; with steps, 0.
     """
 
     moments: int = 1
@@ -29,6 +30,7 @@ class StreamClock(Clock):
     first_step: int = 0
     first_elapsed: float = 0.0
     first_length: float = 1.0
+    overrun: float = 0.0
 
     @property
     def progress(self) -> float:
@@ -52,6 +54,8 @@ class StreamClock(Clock):
 
     def begin(self, moment: int, preset: Preset) -> None:
         """Let a moment begin now, of the length that the preset gives it."""
+        if self.moment and self.budget is not None:
+            self.overrun = max(self.spent - self.budget, 0.0)
         self.moment, self.first_step, self.first_elapsed = moment, self.step, self.elapsed
         self.measure(preset)
 
@@ -61,8 +65,10 @@ class StreamClock(Clock):
         Where of the first and the later ones one has steps and the other a time, nothing is known
         of how much longer the first is.
         """
-        first, later = _length(preset.training), _length(preset.stream)
+        first, later = length_of(preset.training), length_of(preset.stream)
         self.steps, self.budget = later if self.moment else first
+        if self.moment and self.budget is not None:
+            self.budget -= min(self.overrun, self.budget / 2)
         if first[1] is not None and later[1] is not None:
             self.first_length = first[1] / later[1]
         elif first[1] is None and later[1] is None:
@@ -73,15 +79,13 @@ class StreamClock(Clock):
 
         Where steps are counted that is the same in every training: it has no times in it.
         """
-        timed = {} if self.budget is None else {"first_elapsed": self.first_elapsed}
-        return {"moment": self.moment, "first_step": self.first_step, **timed}
+        own: dict[str, Any] = {"moment": self.moment, "first_step": self.first_step}
+        if self.budget is not None:
+            own |= {"first_elapsed": self.first_elapsed, "overrun": self.overrun}
+        return own
 
     def restore(self, state: Mapping[str, Any]) -> None:
         """Return to what ``state`` returned."""
         self.moment, self.first_step = int(state["moment"]), int(state["first_step"])
         self.first_elapsed = float(state.get("first_elapsed", self.before))
-
-
-def _length(options: TrainingOptions | StreamOptions) -> tuple[int, float | None]:
-    """Return steps, and wall time [s] where there is a budget."""
-    return options.steps, None if options.budget is None else parse_duration(options.budget)
+        self.overrun = float(state.get("overrun", 0.0))

@@ -258,3 +258,30 @@ def test_a_moment_may_be_given_a_time(rig: Path, monkeypatch: pytest.MonkeyPatch
     now[0] += 4
     assert clock.progress == pytest.approx(0.4)
     assert clock.spent == pytest.approx(4)
+
+
+def test_a_moment_takes_its_time_with_all_that_follows_its_steps(
+    rig: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    options = "training.budget=60s", "stream.budget=10s"
+    clock, preset = stream_trainer(rig, *options).clock, preset_of(*options)
+    now = [0.0]
+    monkeypatch.setattr(module.StreamClock, "elapsed", property(lambda self: now[0]))
+    now[0] = 63.0  # of which 3 s went into settling and writing: the first is another matter
+    clock.begin(1, preset)
+    now[0] += 10.0
+    assert clock.progress == 1
+    now[0] += 1.0
+    for moment in (2, 3):  # each has 9 s for its steps, and is over after 10
+        clock.begin(moment, preset)
+        now[0] += 4.5
+        assert clock.progress == pytest.approx(0.5)
+        now[0] += 5.5
+    now[0] += 90.0
+    clock.begin(4, preset)  # half of the time is the least that steps are given
+    now[0] += 2.5
+    assert clock.progress == pytest.approx(0.5)
+    again = module.StreamClock(1, None, moments=MOMENTS)
+    again.restore(clock.state())
+    again.measure(preset)
+    assert again.progress == pytest.approx(0.5)
