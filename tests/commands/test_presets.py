@@ -28,7 +28,7 @@ def test_every_preset_says_what_it_is_for(capsys: pytest.CaptureFixture[str]) ->
     assert [about["name"] for about in listed] == preset_names()
     for about in listed:
         assert len(about["description"]) > 20 and "\n" not in about["description"], about
-    assert next(a for a in listed if a["name"] == "n3v")["base"] == ["dnerf", "default"]
+    assert next(a for a in listed if a["name"] == "n3v")["base"] == ["video", "default"]
     presets.run(None)
     assert "NVFi" in capsys.readouterr().out
 

@@ -201,10 +201,7 @@ def test_a_complete_stream_is_not_resumed_and_an_earlier_one_is_replaced(
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (
-            ["--preset", "n3v"],
-            "motion.name is control_points, which is not learnt moment after moment",
-        ),
+        (["--preset", "n3v"], "motion.name is multiscale, which is not learnt moment after moment"),
         (["--set", "stream.budget=ten"], 'stream.budget is "ten"; allowed: null or a positive'),
     ],
 )

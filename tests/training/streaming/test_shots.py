@@ -74,11 +74,7 @@ def test_the_watched_view_is_held_out_where_one_is(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("preset", "options", "message"),
     [
-        (
-            "n3v",
-            ["stream.enabled=true"],
-            "motion.name is control_points, .* has to be one of .*tracks",
-        ),
+        ("n3v", ["stream.enabled=true"], "motion.name is multiscale, .* has to be one of .*tracks"),
         ("persistent", ["splats.sh_degree=1", "splats.sh_start=0.3"], "splats.sh_start is 0.3"),
         ("persistent", ["saliency.gate=freeze"], "saliency.gate is freeze; allowed"),
     ],
