@@ -11,9 +11,9 @@ from moving_room import SEEN, SIZE, THINGS, on_path, seen_points, write_capture,
 from walking_capture import Capture, pixel_errors
 
 from gsdmsr_cli.formats import read_scene
+from gsdmsr_cli.scene.around import cameras_stand_around
 from gsdmsr_cli.scene.camera import Camera
 from gsdmsr_cli.scene.native import cv2
-from gsdmsr_cli.training.starting.around import cameras_stand_around
 
 
 def pixels(camera: Camera, points: np.ndarray) -> np.ndarray:

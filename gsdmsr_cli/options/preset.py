@@ -72,7 +72,7 @@ class SplatOptions:
         start: where they lie: "box" evenly in the scene's box, "silhouettes" where the silhouettes
             of the train views overlap, "surfaces" where neighbouring train views agree.
         start_around: the same where train cameras stand around what they see, which
-            ``training.starting.around`` decides; null makes no difference.
+            ``scene.around`` decides; null makes no difference.
         of_run: folder of a run whose canonical splats are taken as they are in place of all that;
             null takes none.
         opacity: their opacity, between 0 and 1.

@@ -16,10 +16,10 @@ from gsdmsr_cli.ops.neighbours.cpu import mean_squares
 from gsdmsr_cli.ops.planes import Box, Corner
 from gsdmsr_cli.options.preset import SplatOptions
 from gsdmsr_cli.runs.run import open_with_model
+from gsdmsr_cli.scene.around import cameras_stand_around
 from gsdmsr_cli.scene.pictures import Pictures
 from gsdmsr_cli.scene.scene import Scene
 from gsdmsr_cli.training.starting import silhouettes, surfaces
-from gsdmsr_cli.training.starting.around import cameras_stand_around
 from gsdmsr_cli.training.starting.sightings import Points, at_unknown_times, colours_of
 
 NEIGHBOURS = 3

@@ -16,10 +16,10 @@ from rigs import cameras_of
 from gsdmsr_cli.demo.synthetic import camera_on_dome
 from gsdmsr_cli.ground.errors import DataError
 from gsdmsr_cli.options.preset import SplatOptions, load_preset
+from gsdmsr_cli.scene.around import cameras_stand_around
 from gsdmsr_cli.scene.camera import Camera, look_at
 from gsdmsr_cli.scene.pictures import Pictures
 from gsdmsr_cli.scene.scene import Scene, View
-from gsdmsr_cli.training.starting.around import cameras_stand_around
 from gsdmsr_cli.training.starting.initial import initial_splats
 
 
