@@ -31,11 +31,11 @@ from gsdmsr_cli.training.trainer import Trainer
 MAY_CHANGE = (
     "training.budget", "training.steps", "training.threads", "training.checkpoint_minutes",
     "training.keep", "data.cache_mib", "stream.budget", "stream.steps",
-    "splats.of_run", "training.views_per_step",
+    "splats.of_run", "training.views_per_step", "training.cuda_graphs",
 )  # fmt: skip
 """Options that a resumed training may have otherwise: its length, what changes no result, such
-as where the run lies now whose splats it has begun with, and the views of a step, which another
-device may want otherwise or have no memory for."""
+as where the run lies now whose splats it has begun with, and what another device may want otherwise
+or have no memory for."""
 
 
 class _CompleteError(UsageError):

@@ -7,7 +7,7 @@ field.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -223,6 +223,14 @@ class Layer(ABC):
             the names of the parameters that have new values.
         """
         return ()
+
+    def constants(self) -> Hashable | None:
+        """Return what else than parameters and times ``at_instants`` hangs on, while it trains.
+
+        A step that was recorded on a GPU is replayed while that stays the same. All times are to
+        be read as ``recording.vary`` has it. None if the layer cannot be recorded.
+        """
+        return None
 
     def following(self) -> Following | None:
         """Return what splats follow, if this layer does no more than let them follow it."""

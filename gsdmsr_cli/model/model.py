@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -251,6 +251,18 @@ class Model:
         """
         for parameter in self.parameters():
             parameter.hold_outside(first, last)
+
+    def constants(self) -> Hashable | None:
+        """Return what else than parameters and times ``at_instants`` hangs on; see ``Layer``.
+
+        None if a layer cannot be recorded.
+        """
+        if self.needs_camera or self.needs_jitter or self.holds_views or self.shades:
+            return None
+        own = tuple(layer.constants() for layer in self.layers.values())
+        if None in own:
+            return None
+        return len(self.splats), self.moving, self.precision, own
 
     def penalty(self, instant: Instant, generator: torch.Generator) -> Tensor | None:
         """Return the sum of the layers' regularisers at ``instant``, or None if there are none."""

@@ -128,6 +128,7 @@ class TrainingOptions:
         threads: number of CPU threads; 0 takes all cores.
         precision: what the motion's grids and networks are read and computed in on a GPU; values
             that are trained, and their gradients, are float32 all the same.
+        cuda_graphs: whether a GPU replays the launches of a step where the motion lets it.
     """
 
     steps: int = 10000
@@ -149,6 +150,7 @@ class TrainingOptions:
     seed: int = 0
     threads: int = 0
     precision: Literal["float32", "bf16", "fp16"] = "float32"
+    cuda_graphs: bool = True
 
     def __post_init__(self) -> None:
         require_at_least(self, 1, "steps", "keep")

@@ -40,6 +40,19 @@ class DensityStatistics:
         self.total += length
         self.views += length > 0
 
+    @torch.no_grad()
+    def observe_views(self, gradients: Tensor, width: int, height: int) -> None:
+        """Do what ``observe`` does of V views of one size, by the launches of one on a GPU.
+
+        Args:
+            gradients: (V, N, 2), of each view.
+            width, height: of their pictures [px].
+        """
+        x, y = gradients.unbind(2)
+        lengths = torch.hypot(x * (0.5 * width), y * (0.5 * height)).nan_to_num(0.0, 0.0)
+        self.total += lengths.sum(dim=0)
+        self.views += (lengths > 0).sum(dim=0)
+
     def mean(self) -> Tensor:
         """Return the (N,) means; 0 where a splat was never drawn."""
         return self.total / self.views.clamp(min=1)

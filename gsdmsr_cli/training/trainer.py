@@ -316,10 +316,19 @@ class Trainer:
             if weights is not None and errors is not None and bool(loss.isfinite()):
                 self.tiles.learn(order.row, weights, errors.cpu())
         if progress < self.preset.density.until:
-            valid = None if loss.is_cpu else loss * 0 + 1
+            self._observe(views, loss)
+
+    def _observe(self, views: Sequence[ViewGradients], loss: Tensor) -> None:
+        statistics, sizes = self.population.statistics, {view.size for view in views}
+        if loss.is_cpu:
             for view in views:
-                on_screen = view.on_screen if valid is None else view.on_screen * valid
-                self.population.statistics.observe(on_screen, *view.size)
+                statistics.observe(view.on_screen, *view.size)
+        elif len(sizes) == 1:
+            together = torch.stack([view.on_screen for view in views]) * (loss * 0 + 1)
+            statistics.observe_views(together, *sizes.pop())
+        else:
+            for view in views:
+                statistics.observe(view.on_screen * (loss * 0 + 1), *view.size)
 
     def _is_gated(self, progress: float) -> bool:
         options = self.preset.saliency

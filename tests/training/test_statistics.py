@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 import torch
 from kernel_checks import generator
@@ -25,6 +27,18 @@ def test_statistics_do_not_depend_on_the_resolution() -> None:
         statistics.append(DensityStatistics(5))
         statistics[-1].observe(gradient / scale, 40 * scale, 20 * scale)
     torch.testing.assert_close(statistics[0].mean(), statistics[1].mean())
+
+
+def test_views_of_one_size_are_observed_together_as_one_by_one() -> None:
+    gradients = torch.randn(3, 7, 2, generator=generator())
+    gradients[1, 2], gradients[0, 3], gradients[:, 4] = math.nan, 0, 0
+    together, alone = DensityStatistics(7), DensityStatistics(7)
+    together.observe_views(gradients, 40, 20)
+    for gradient in gradients:
+        alone.observe(gradient, 40, 20)
+    torch.testing.assert_close(together.total, alone.total)
+    assert torch.equal(together.views, alone.views)
+    assert together.views.tolist() == [3, 3, 2, 2, 0, 3, 3]
 
 
 def test_statistics_follow_rows_that_go_or_change_places() -> None:

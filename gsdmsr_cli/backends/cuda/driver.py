@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import sys
-from ctypes import byref, c_char_p, c_int, c_uint, c_void_p
+from ctypes import byref, c_char_p, c_int, c_size_t, c_uint, c_uint64, c_void_p
 from typing import Any
 
 import torch
@@ -14,6 +14,24 @@ from gsdmsr_cli.backends.cuda.nvrtc import load_nvrtc
 from gsdmsr_cli.ground.errors import GsdmsrError
 
 _LIBRARY = "nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1"
+
+
+_CAPTURING = 1
+"""CU_STREAM_CAPTURE_STATUS_ACTIVE."""
+
+
+class _NodeParams(ctypes.Structure):
+    """CUDA_KERNEL_NODE_PARAMS_v2; the last two, if given, stand for the function."""
+
+    _fields_ = (
+        ("function", c_void_p),
+        *((name, c_uint) for name in ("grid_x", "grid_y", "grid_z")),
+        *((name, c_uint) for name in ("block_x", "block_y", "block_z", "shared")),
+        ("arguments", c_void_p),
+        ("extra", c_void_p),
+        ("kernel", c_void_p),
+        ("context", c_void_p),
+    )
 
 
 class Driver:
@@ -53,7 +71,7 @@ class Driver:
         Raises:
             GsdmsrError: the program does not compile, or the driver refuses it.
         """
-        index = torch.cuda.current_device() if device.index is None else device.index
+        index = _index(device)
         self._enter(index)
         function = self._kernel(index, source, kernel)
         stream = _current_stream(index)
@@ -62,6 +80,85 @@ class Driver:
                 function, *grid, 1, block, 1, 1, 0, stream, ctypes.addressof(arguments), None
             ),
             f"launching {kernel}",
+        )
+
+    def last_node(self, device: torch.device) -> int:
+        """Return the node of the last launch on torch's current stream, which is being captured.
+
+        Raises:
+            GsdmsrError: the driver refuses, or nothing is captured there.
+        """
+        status, identity, graph = c_int(), c_uint64(), c_void_p()
+        nodes, count = ctypes.POINTER(c_void_p)(), c_size_t()
+        stream = c_void_p(_current_stream(_index(device)))
+        found = byref(status), byref(identity), byref(graph), byref(nodes)
+        ask = self._cuda.cuStreamGetCaptureInfo_v2
+        self._check(ask(stream, *found, byref(count)), "asking what is captured")
+        if status.value != _CAPTURING or count.value != 1:
+            raise GsdmsrError(f"no launch is captured (status {status.value}, {count.value} nodes)")
+        node: int = nodes[0]
+        return node
+
+    def instantiate(self, graph: int, device: torch.device) -> int:
+        """Return the handle of a CUgraphExec, a graph that can be executed; see ``destroy``.
+
+        Raises:
+            GsdmsrError: the driver refuses.
+        """
+        self._enter(_index(device))
+        made = c_void_p()
+        self._check(
+            self._cuda.cuGraphInstantiateWithFlags(byref(made), c_void_p(graph), c_uint64(0)),
+            "making a graph",
+        )
+        assert made.value is not None
+        return made.value
+
+    def execute(self, executable: int, device: torch.device) -> None:
+        """Launch a graph on torch's current stream.
+
+        Raises:
+            GsdmsrError: the driver refuses.
+        """
+        index = _index(device)
+        self._enter(index)
+        stream = c_void_p(_current_stream(index))
+        self._check(self._cuda.cuGraphLaunch(c_void_p(executable), stream), "launching a graph")
+
+    def destroy(self, executable: int) -> None:
+        """Let go of a graph; one that runs is let go of afterwards."""
+        self._cuda.cuGraphExecDestroy(c_void_p(executable))
+
+    def give_node(
+        self,
+        executable: int,
+        node: int,
+        source: str,
+        kernel: str,
+        grid: tuple[int, int],
+        block: int,
+        arguments: ctypes.Array[c_void_p],
+        device: torch.device,
+    ) -> None:
+        """Give a launch of a graph that can be executed other arguments from now on.
+
+        Args:
+            executable: handle of a CUgraphExec.
+            node: of the graph that it was made from, see ``last_node``.
+            source, kernel, grid, block, arguments, device: see ``launch``.
+
+        Raises:
+            GsdmsrError: the driver refuses.
+        """
+        function = self._kernel(_index(device), source, kernel)
+        params = _NodeParams(
+            function, *grid, 1, block, 1, 1, 0, ctypes.addressof(arguments), None, None, None
+        )
+        self._check(
+            self._cuda.cuGraphExecKernelNodeSetParams_v2(
+                c_void_p(executable), c_void_p(node), byref(params)
+            ),
+            f"giving {kernel} other arguments",
         )
 
     def _enter(self, index: int) -> None:
@@ -107,6 +204,10 @@ class Driver:
             self._cuda.cuGetErrorString(status, byref(text))
             reason = (text.value or b"unknown error").decode()
             raise GsdmsrError(f"the NVIDIA driver failed when {doing}: {reason} ({status})")
+
+
+def _index(device: torch.device) -> int:
+    return torch.cuda.current_device() if device.index is None else device.index
 
 
 def _current_stream(index: int) -> int:

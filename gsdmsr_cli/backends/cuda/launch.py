@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import ctypes
 from functools import cache
-from typing import Protocol
+from typing import Protocol, cast
 
 import torch
 from torch import Tensor
 
+from gsdmsr_cli.backends.cuda import recording
 from gsdmsr_cli.backends.cuda.driver import Driver
 
 Argument = Tensor | int | float | ctypes.Structure | None
@@ -58,9 +59,18 @@ def launch(
     device = on or next((a.device for a in arguments if isinstance(a, Tensor)), None)
     if device is None:
         raise ValueError(f"{kernel} was given no tensor")
-    if device.type == "cuda" and "cuda" not in runners:
+    if device.type == "cuda":
+        driver()
+    given = source, kernel, grid, block, addresses, device
+    runners[device.type].launch(*given)
+    recording.tell(lambda: recording.Launched(*given, values))
+
+
+def driver() -> Driver:
+    """Return who runs kernels on NVIDIA GPUs."""
+    if "cuda" not in runners:
         runners["cuda"] = Driver()
-    runners[device.type].launch(source, kernel, grid, block, addresses, device)
+    return cast(Driver, runners["cuda"])
 
 
 def serves(*tensors: Tensor) -> bool:

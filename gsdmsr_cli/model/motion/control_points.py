@@ -10,7 +10,7 @@ each of which moves its neighbourhood as a rigid body, has less freedom to do so
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -97,10 +97,17 @@ class ControlPointMotion(ControlPoints):
 
     def _deformations(self, points: Tensor, times: Sequence[float]) -> Tensor:
         """Return the outputs for points; times [0, 1] are mapped to the whole grid, [-1, 1]."""
-        places = [2 * self._place(time) - 1 for time in times]
-        features = planes.lookup_at_times(self.levels, points, places, self.facts.box)
+        given = self.levels, points, times, self.facts.box
+        features = planes.lookup_at_times(*given, place=self._on_grid)
         outputs = network.apply_network(self.layers, features)
         return outputs.view(len(times), len(points), OUTPUTS)
+
+    def _on_grid(self, time: float) -> float:
+        return planes.evenly(self._place(time))
+
+    def constants(self) -> Hashable:
+        """Return nothing: whatever is read is a parameter, or hangs on the time alone."""
+        return ()
 
     def penalty(self, moment: Moment, instant: Instant, generator: torch.Generator) -> Tensor:
         """Return the plane regularisers, and the rigidity of control points at a random time.

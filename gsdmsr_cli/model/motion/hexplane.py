@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -77,8 +77,10 @@ class HexPlaneMotion(Layer):
         """Return the deformed splats at several times."""
         splats = moment.splats
         points = splats.means.detach() if self.options.detach else splats.means
-        times = [2 * instant.time - 1 for instant in instants]
-        features = planes.lookup_at_times(self.levels, points, times, self.facts.box)
+        times = [instant.time for instant in instants]
+        features = planes.lookup_at_times(
+            self.levels, points, times, self.facts.box, place=planes.evenly
+        )
         deformations = network.apply_network(self._network(), features)
         parts = split_times(deformations, len(times))
         return [replace(moment, splats=displace(splats, own)) for own in parts]
@@ -90,6 +92,10 @@ class HexPlaneMotion(Layer):
         *layers, last = self.layers
         self._own = self._own.to(last.weight.device)  # the model may have moved to a device
         return [*layers, network.Layer(last.weight * self._own, last.bias)]
+
+    def constants(self) -> Hashable:
+        """Return nothing: whatever is read is a parameter, or hangs on the time alone."""
+        return ()
 
     def penalty(self, moment: Moment, instant: Instant, generator: torch.Generator) -> Tensor:
         """Return the plane regularisers."""

@@ -10,7 +10,7 @@ Beyond the method, every splat has features of its own for the fine decoder (E-D
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -149,12 +149,17 @@ class MultiscaleMotion(Layer):
         embeddings: Tensor | None = None,
     ) -> Tensor:
         points = splats.means.detach() if self.options.detach else splats.means
-        times = [2 * instant.time - 1 for instant in instants]
-        return planes.lookup_at_times(levels, points, times, self.facts.box, embeddings)
+        times = [instant.time for instant in instants]
+        given = levels, points, times, self.facts.box, embeddings
+        return planes.lookup_at_times(*given, planes.evenly)
 
     def advance(self, progress: float) -> None:
         """Let the fine field join after ``coarse_until``."""
         self.fine_active = progress >= self.options.coarse_until
+
+    def constants(self) -> Hashable:
+        """Return whether the fine field has joined."""
+        return self.fine_active
 
     def penalty(self, moment: Moment, instant: Instant, generator: torch.Generator) -> Tensor:
         """Return the regularisers of the active grids, L_reg, L_smooth and that of embeddings.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Hashable
 from dataclasses import dataclass
 
 import torch
@@ -22,6 +23,10 @@ class Static(Layer):
     def at(self, moment: Moment, instant: Instant) -> Moment:
         """Return the moment itself."""
         return moment
+
+    def constants(self) -> Hashable:
+        """Return nothing: there is nothing to read."""
+        return ()
 
 
 def start(options: Options, facts: Facts, splats: Splats, generator: torch.Generator) -> Static:

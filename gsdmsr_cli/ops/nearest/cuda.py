@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from gsdmsr_cli.backends.cuda import recording
 from gsdmsr_cli.backends.cuda.launch import blocks, launch
 
 _THREADS = 128
@@ -17,7 +18,7 @@ def nearest(queries: Tensor, points: Tensor, near: Tensor) -> Tensor:
         queries, points: (N, 3), (M, 3).
         near: (N, K) int32 guesses, see ``ops.nearest.nearest_points``; K is at most M.
     """
-    found = near.clone(memory_format=torch.contiguous_format)
+    found = recording.keep(near).clone(memory_format=torch.contiguous_format)
     count, kept = found.shape
     launch(
         "nearest", "nearest", (blocks(count, _THREADS), 1), _THREADS,

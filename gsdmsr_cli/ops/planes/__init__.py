@@ -24,7 +24,10 @@ from gsdmsr_cli.ops.planes.levels import (
     Box,
     Corner,
     Level,
+    Place,
+    as_given,
     check_levels,
+    evenly,
     features_of,
     new_level,
     new_levels,
@@ -38,7 +41,10 @@ __all__ = [
     "Box",
     "Corner",
     "Level",
+    "Place",
+    "as_given",
     "check_levels",
+    "evenly",
     "features_of",
     "lookup",
     "lookup_at_times",
@@ -74,19 +80,24 @@ def lookup_at_times(
     times: Sequence[float],
     box: Box = CUBE,
     beside: Tensor | None = None,
+    place: Place = as_given,
 ) -> Tensor:
-    """Return what ``lookup`` does at each of V times, (V N, C), one time after the other."""
+    """Return what ``lookup`` does at each of V times, (V N, C), one time after the other.
+
+    ``place`` takes each of the times to where it lies on the grid, in [-1, 1]. In a step that is
+    recorded the times are those of its views, and so they are when it is replayed.
+    """
     tensors = [tensor for level in levels for tensor in level]
     own = points.new_empty(len(points), 0) if beside is None else beside
     form = choose(points, own, *tensors)
     if form == "cuda":
         placed = to_cube(box).tolist()
-        return cuda.lookup(points, own, times, placed, tensors, precision.chosen())
+        return cuda.lookup(points, own, times, placed, tensors, precision.chosen(), place)
     if form == "cpu":
         given = points.contiguous()
-        features = [_Lookup.apply(given, own, time, box, *tensors) for time in times]
+        features = [_Lookup.apply(given, own, place(time), box, *tensors) for time in times]
     else:
-        features = [lookup_twin(levels, points, time, box, own) for time in times]
+        features = [lookup_twin(levels, points, place(time), box, own) for time in times]
     return features[0] if len(features) == 1 else torch.cat(features)
 
 

@@ -7,15 +7,17 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 from torch.autograd import Function
 from torch.autograd.function import once_differentiable
 
+from gsdmsr_cli.backends.cuda import recording
 from gsdmsr_cli.backends.cuda.compiler import MOST_LEVELS, MOST_VIEWS
 from gsdmsr_cli.backends.cuda.launch import blocks, launch
+from gsdmsr_cli.ops.planes.levels import Place, as_given
 
 CHANNELS = 16
 """Of a chunk, as in lookup.cuh."""
@@ -49,6 +51,26 @@ class _Levels(ctypes.Structure):
     )
 
 
+class _Times(NamedTuple):
+    """Times at which a grid is read.
+
+    Attributes:
+        own: the times, in the order in which features are wanted.
+        place: where each lies on the grid, in [-1, 1].
+    """
+
+    own: Sequence[float]
+    place: Place
+
+    def placed(self) -> list[float]:
+        """Return where they lie."""
+        return [self.place(time) for time in self.own]
+
+    def fill(self, packed: _Levels, inputs: Any) -> None:
+        """Write the times of other inputs, see ``recording.vary``."""
+        packed.moment[: len(self.own)] = self._replace(own=inputs.times).placed()
+
+
 def lookup(
     points: Tensor,
     beside: Tensor,
@@ -56,19 +78,21 @@ def lookup(
     to_cube: Sequence[Sequence[float]],
     tensors: Sequence[Tensor],
     dtype: torch.dtype = torch.float32,
+    place: Place = as_given,
 ) -> Tensor:
     """Return features (V N, C + K) of points at V times, all levels and ``beside`` side by side.
 
     Args:
         points: (N, 3).
         beside: (N, K), the last columns.
-        times: each in [-1, 1].
+        times: of which ``place`` says where they lie on the grid, in [-1, 1].
         to_cube: what to multiply positions by and what to add, (2, 3), to take them to [-1, 1].
         tensors: of each level space (3, chunks, R, R, 16) and time (3, chunks, T, R, 16).
         dtype: the format that grids are read in, see ``SOURCES``. Features are float32, and so
             are gradients, which pass through the rounding as if there were none.
     """
-    features: Tensor = _Lookup.apply(points.contiguous(), beside, times, to_cube, dtype, *tensors)
+    given = points.contiguous(), beside, _Times(times, place), to_cube, dtype
+    features: Tensor = _Lookup.apply(*given, *tensors)
     return features
 
 
@@ -79,7 +103,7 @@ def penalty(weights: tuple[float, float, float], tensors: Sequence[Tensor]) -> T
 
 
 def _pack(
-    moments: Sequence[float],
+    moments: _Times,
     to_cube: Sequence[Sequence[float]],
     tensors: Sequence[Tensor],
     nodes: Sequence[Tensor],
@@ -91,10 +115,12 @@ def _pack(
     spaces, times = tensors[::2], tensors[1::2]
     if len(spaces) > MOST_LEVELS:
         raise ValueError(f"{len(spaces)} levels of grids; at most {MOST_LEVELS} are looked up")
-    if len(moments) > MOST_VIEWS:
-        raise ValueError(f"{len(moments)} times; at most {MOST_VIEWS} are looked up at once")
+    if len(moments.own) > MOST_VIEWS:
+        raise ValueError(f"{len(moments.own)} times; at most {MOST_VIEWS} are looked up at once")
     cube = ((ctypes.c_float * 3)(*part) for part in to_cube)
-    packed = _Levels(len(spaces), len(moments), (ctypes.c_float * MOST_VIEWS)(*moments), *cube)
+    placed = (ctypes.c_float * MOST_VIEWS)(*moments.placed())
+    packed = _Levels(len(spaces), len(moments.own), placed, *cube)
+    recording.vary(packed, moments.fill)
     columns = spaces, times, nodes, lines, gradients[::2], gradients[1::2], d_lines
     for name, column in zip(_POINTERS, columns, strict=True):
         for level, tensor in zip(packed.level, column, strict=False):
@@ -126,19 +152,18 @@ class _Lookup(Function):
         ctx: Any,
         points: Tensor,
         beside: Tensor,
-        times: Sequence[float],
+        times: _Times,
         to_cube: Sequence[Sequence[float]],
         dtype: torch.dtype,
         *tensors: Tensor,
     ) -> Tensor:
         spaces, halved, source = tensors[::2], dtype is not torch.float32, SOURCES[dtype]
         nodes = [torch.empty_like(t, dtype=dtype) for t in spaces] if halved else spaces
-        lines = [
-            space.new_empty(len(times), *space[:, :, 0].shape, dtype=dtype) for space in spaces
-        ]
+        count = len(times.own)
+        lines = [space.new_empty(count, *space[:, :, 0].shape, dtype=dtype) for space in spaces]
         packed = _pack(times, to_cube, tensors, nodes, lines)
         ctx.columns = sum(space.shape[1] * CHANNELS for space in spaces)
-        features = points.new_empty(len(times), len(points), ctx.columns + beside.shape[1])
+        features = points.new_empty(count, len(points), ctx.columns + beside.shape[1])
         features[:, :, ctx.columns :] = beside
         _over_levels(source, "collapse", packed, [*nodes, *lines] if halved else lines)
         launch(
@@ -169,8 +194,8 @@ class _Lookup(Function):
         _over_levels(source, "spread", packed, d_times)
         d_beside = None
         if ctx.needs_input_grad[1]:
-            own = given[:, ctx.columns :]
-            d_beside = own if len(times) == 1 else own.view(len(times), len(points), -1).sum(dim=0)
+            own, count = given[:, ctx.columns :], len(times.own)
+            d_beside = own if count == 1 else own.view(count, len(points), -1).sum(dim=0)
         return d_points if wanted else None, d_beside, None, None, None, *gradients
 
 

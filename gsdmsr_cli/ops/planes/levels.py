@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from types import MappingProxyType
 from typing import NamedTuple
 
@@ -18,6 +18,19 @@ Box = tuple[Corner, Corner]
 """Lower and upper corner [world units], the upper one above the lower along every axis."""
 
 CUBE: Box = ((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
+
+Place = Callable[[float], float]
+"""Takes a time to where it lies on a grid, in [-1, 1]."""
+
+
+def as_given(time: float) -> float:
+    """Return a time that is one of the grid."""
+    return time
+
+
+def evenly(time: float) -> float:
+    """Return where a time in [0, 1] lies on a grid that it is mapped to evenly, and whole."""
+    return 2 * time - 1
 
 
 class Level(NamedTuple):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -25,6 +25,7 @@ from gsdmsr_cli.scene.scene import MASK, View
 from gsdmsr_cli.training.gradients.compare import compare, compare_views, sum_of
 from gsdmsr_cli.training.gradients.depth_terms import add_depth_terms
 from gsdmsr_cli.training.gradients.phase import Order, Phase, ViewGradients
+from gsdmsr_cli.training.gradients.replays import Replays, ViewInputs, recorder_for
 from gsdmsr_cli.training.losses import Seen, start_term
 
 
@@ -83,6 +84,8 @@ class TrainingRenderer:
         self.notes = [text for text in told if text is not None]
         self._halved = HalvedPictures(pictures)
         self._resident = ResidentPictures(torch.device(device), preset.data.cache_mib << 20)
+        self._replays = Replays(recorder_for(torch.device(device), preset.training.cuda_graphs))
+        self._mask: Tensor | None = None
 
     def cache_in(self, folder: Path) -> None:
         """Let terms keep in a run folder what is costly to compute; before workers are forked."""
@@ -136,20 +139,75 @@ class TrainingRenderer:
         return able and whole and _alike([look.camera for look in looks], weights)
 
     def _at_once(self, model: Model, looks: Sequence[_Look], phase: Phase) -> list[ViewGradients]:
-        assert isinstance(self.engine, ComparingViews)
+        known = self._known(model, looks, phase)
+        if known is not None:
+            return self._replayed(known, model, looks, phase)
         moments = self._moved(model, [i for look in looks for i in look.instants], phase)
-        found = compare_views(
-            self.engine, model,
-            [model.as_seen(moments[look.instant], look.instant) for look in looks],
-            [look.camera for look in looks], self.background, [look.target for look in looks],
-            self._ssim_weight(phase.progress, phase.frozen), self._sh_degree(phase.progress),
-            [self._on_device(look.order.tile_weights) for look in looks],
-            [self._further(model, look, moments, phase) for look in looks],
-        )  # fmt: skip
+        seen = [model.as_seen(moments[look.instant], look.instant) for look in looks]
+        further = [self._further(model, look, moments, phase) for look in looks]
+        found = self._compared(model, looks, seen, further, phase)
         return [
             self._with_depth_terms(own, model, look, moments[look.instant], phase)
             for own, look in zip(found, looks, strict=True)
         ]
+
+    def _compared(
+        self,
+        model: Model,
+        looks: Sequence[_Look],
+        moments: Sequence[Moment],
+        further: Sequence[Tensor | None],
+        phase: Phase,
+    ) -> list[ViewGradients]:
+        assert isinstance(self.engine, ComparingViews)
+        return compare_views(
+            self.engine, model, moments, [look.camera for look in looks], self.background,
+            [look.target for look in looks], self._ssim_weight(phase.progress, phase.frozen),
+            self._sh_degree(phase.progress),
+            [self._on_device(look.order.tile_weights) for look in looks], further,
+        )  # fmt: skip
+
+    def _known(self, model: Model, looks: Sequence[_Look], phase: Phase) -> Hashable | None:
+        """Return all but the views that their gradients hang on, or None if not all is known."""
+        constants = model.constants() if self._replays.able and not self.terms else None
+        if constants is None or any(look.order.tile_weights is not None for look in looks):
+            return None
+        camera, mask = looks[0].camera, phase.gradient_mask
+        return (
+            len(looks), camera.width, camera.height, phase.moving, mask is not None,
+            self._ssim_weight(phase.progress, phase.frozen), self._sh_degree(phase.progress),
+            constants, tuple((p.tensor.data_ptr(), p.tensor.shape) for p in model.parameters()),
+        )  # fmt: skip
+
+    def _replayed(
+        self, known: Hashable, model: Model, looks: Sequence[_Look], phase: Phase
+    ) -> list[ViewGradients]:
+        """Return the gradients by work that is the same for all views, to be replayed."""
+        mask = self._kept_mask(phase.gradient_mask)
+        instants = [look.instant for look in looks]
+        inputs = ViewInputs(
+            [look.camera for look in looks], [instant.time for instant in instants],
+            [look.target for look in looks],
+        )  # fmt: skip
+
+        def work() -> list[ViewGradients]:
+            # two views of one time are two here, as they are of two times when it is replayed
+            moments = (
+                model.at_instants(instants, mask)
+                if phase.moving
+                else [Moment(model.splats)] * len(looks)
+            )
+            return self._compared(model, looks, moments, [None] * len(looks), phase)
+
+        return self._replays.run((known, None if mask is None else mask.data_ptr()), inputs, work)
+
+    def _kept_mask(self, mask: Tensor | None) -> Tensor | None:
+        """Return the mask where the masks of all steps lie."""
+        if mask is None:
+            return None
+        if self._mask is None or self._mask.shape != mask.shape:
+            self._mask = torch.empty_like(mask)
+        return self._mask.copy_(mask)
 
     def _alone(self, model: Model, look: _Look, phase: Phase) -> ViewGradients:
         moments = self._moved(model, look.instants, phase)

@@ -73,6 +73,57 @@ int cuLaunchKernel(
     return failing;
 }
 
+static Pointer last_node;
+
+int cuStreamGetCaptureInfo_v2(
+    Pointer stream, int *status, unsigned long long *identity, Pointer *graph,
+    const Pointer **nodes, unsigned long *count
+) {
+    last_node = (Pointer)(long)5000000000000;
+    *status = (long)stream == 4000000000000;
+    *identity = 7, *graph = 0, *nodes = &last_node, *count = 1;
+    note("ask");
+    return 0;
+}
+
+int cuGraphInstantiateWithFlags(Pointer *made, Pointer graph, unsigned long long flags) {
+    *made = (Pointer)(long)7000000000000;
+    note((long)graph == 6000000000000 && flags == 0 ? "instantiate" : "instantiate nonsense");
+    return failing;
+}
+
+struct Params {
+    Pointer function;
+    unsigned x, y, z, bx, by, bz, shared;
+    void **given;
+    void **extra;
+    Pointer kernel, context;
+};
+
+int cuGraphExecKernelNodeSetParams_v2(Pointer made, Pointer node, const struct Params *params) {
+    char text[200];
+    struct Three *three = (struct Three *)params->given[0];
+    snprintf(
+        text, sizeof text, "give %d %d %d %u %u %u %u %u %u %u %g %g %d", (long)made == 7000000000000,
+        (long)node == 5000000000000, (long)params->function == 3000000000000, params->x, params->y,
+        params->z, params->bx, params->by, params->bz, params->shared, three->value,
+        *(float *)params->given[2], params->extra || params->kernel || params->context
+    );
+    note(text);
+    return failing;
+}
+
+int cuGraphLaunch(Pointer made, Pointer stream) {
+    int right = (long)made == 7000000000000 && (long)stream == 4000000000000;
+    note(right ? "execute" : "execute nonsense");
+    return failing;
+}
+
+int cuGraphExecDestroy(Pointer made) {
+    note((long)made == 7000000000000 ? "destroy" : "destroy nonsense");
+    return 0;
+}
+
 int cuGetErrorString(int status, const char **text) {
     *text = "no image";
     return 0;

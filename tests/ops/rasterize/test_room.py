@@ -6,6 +6,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from gsdmsr_cli.backends.cuda import recording
 from gsdmsr_cli.ops.rasterize.cuda.room import LEAST, MARGIN, WINDOW, Room
 
 LARGE = 100 * LEAST
@@ -81,3 +82,43 @@ def test_lists_that_grow_again_lose_their_end_once() -> None:
         find(room, length)
     assert find(room, 14 * LARGE) >= 14 * LARGE
     assert room.overflows == 1
+
+
+class Followed:
+    """Listens while work is recorded."""
+
+    def __init__(self) -> None:
+        self.lists: list[recording.Followed] = []
+
+    def follow(self, what: recording.Followed) -> None:
+        self.lists.append(what)
+
+
+def test_a_recorded_list_keeps_its_room_and_is_recorded_anew_when_that_is_short() -> None:
+    room, length, followed = Room(), torch.tensor(LARGE), Followed()
+    found = room.find(length, "a", 1000, False)
+    with recording.recorded_by(followed):  # type: ignore[arg-type]
+        assert room.find(length, "a", 1000, False) == found
+    (recorded,) = followed.lists
+    assert recorded.is_good()
+    for now, good in ((found // 2, True), (found, True), (found + 1, False)):
+        length.fill_(now)  # what a replay writes
+        recorded.replayed()
+        assert recorded.is_good() is good
+    assert room.overflows == 1
+    assert room.find(length, "a", 1000, False) > found
+
+
+def test_nothing_is_asked_of_the_gpu_while_a_list_is_recorded() -> None:
+    """An event that is asked while a stream is captured spoils the capture."""
+
+    class Untouchable:
+        def query(self) -> bool:
+            raise AssertionError("asked")
+
+    room, length = Room(), torch.tensor(LARGE)
+    room.find(length, "a", 1000, False)
+    for news in room._news.values():
+        news[:] = [one._replace(arrived=Untouchable()) for one in news]
+    with recording.recorded_by(Followed()):  # type: ignore[arg-type]
+        assert room.find(length, "a", 1000, False) >= LARGE

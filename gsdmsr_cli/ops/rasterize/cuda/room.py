@@ -10,6 +10,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from gsdmsr_cli.backends.cuda import recording
+
 MARGIN = 1.5
 """Room in units of the longest of the last lists."""
 
@@ -63,13 +65,21 @@ class Room:
         if exact:
             return max(int(length), 1)
         kind = length.device, kind
-        self._read(kind)
+        recorded = recording.is_recording()
+        if not recorded:  # while a stream is captured no event may be asked
+            self._read(kind)
         shares = self._shares.setdefault(kind, deque(maxlen=WINDOW))
         if not any(shares):
             shares.append(int(length) / rows)
         room = _rounded(MARGIN * max(shares) * rows)
-        self._news.setdefault(kind, []).append(_send(length, rows, room))
+        if recorded:
+            recording.follow(_Recorded(self, kind, length, rows, room))
+        else:
+            self._send(kind, length, rows, room)
         return room
+
+    def _send(self, kind: Hashable, length: Tensor, rows: int, room: int) -> None:
+        self._news.setdefault(kind, []).append(_send(length, rows, room))
 
     def _read(self, kind: Hashable) -> None:
         """Learn from the lengths that have arrived."""
@@ -78,6 +88,25 @@ class Room:
             length, _, rows, room = news.pop(0)
             self.overflows += int(length) > room
             self._shares[kind].append(int(length) / rows)
+
+
+class _Recorded(NamedTuple):
+    """A list of a recorded step, whose room stays what it was; see ``recording.Followed``."""
+
+    rooms: Room
+    kind: Hashable
+    length: Tensor
+    rows: int
+    room: int
+
+    def is_good(self) -> bool:
+        """Return whether the longest of the last lists has room."""
+        self.rooms._read(self.kind)
+        return max(self.rooms._shares[self.kind]) * self.rows <= self.room
+
+    def replayed(self) -> None:
+        """Let the length come from the GPU."""
+        self.rooms._send(self.kind, self.length, self.rows, self.room)
 
 
 def _send(length: Tensor, rows: int, room: int) -> _News:

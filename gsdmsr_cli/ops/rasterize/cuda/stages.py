@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from gsdmsr_cli.backends.cuda import recording
 from gsdmsr_cli.backends.cuda.compiler import MOST_VIEWS
 from gsdmsr_cli.backends.cuda.launch import blocks, launch, struct
 from gsdmsr_cli.ground.splatting_constants import TILE, tile_grid
@@ -151,12 +152,17 @@ def views_of(cameras: Sequence[Camera]) -> Views:
             f"allowed: 1 to {MOST_VIEWS} of one size"
         )
     packed = _Views()
+    _fill_views(packed, cameras)
+    recording.vary(packed, lambda packed, inputs: _fill_views(packed, inputs.cameras))
+    return Views(packed, len(cameras), *sizes.pop())
+
+
+def _fill_views(packed: _Views, cameras: Sequence[Camera]) -> None:
     for view, camera in zip(packed.view, cameras, strict=False):
         view.rotation[:] = camera.rotation.flatten().tolist()
         view.translation[:] = camera.translation.tolist()
         view.intrinsics[:] = [camera.fx, camera.fy, camera.cx, camera.cy]
         view.centre[:] = camera.centre.tolist()
-    return Views(packed, len(cameras), *sizes.pop())
 
 
 def project(views: Views, stored: Stored, terms: int) -> Projected:
@@ -376,9 +382,15 @@ def compare(
 
 def _targets(views: Views, targets: Sequence[Tensor]) -> ctypes.Structure:
     shape = 3, views.height, views.width
+
+    def fill(packed: _Targets, targets: Sequence[Tensor]) -> None:
+        for i, target in enumerate(targets):
+            if target.shape != shape or target.dtype != torch.uint8 or not target.is_contiguous():
+                raise ValueError(
+                    f"a target is {tuple(target.shape)} {target.dtype}, not {shape} uint8"
+                )
+            packed.of_view[i] = target.data_ptr()
+
     packed = _Targets()
-    for i, target in enumerate(targets):
-        if target.shape != shape or target.dtype != torch.uint8 or not target.is_contiguous():
-            raise ValueError(f"a target is {tuple(target.shape)} {target.dtype}, not {shape} uint8")
-        packed.of_view[i] = target.data_ptr()
-    return packed
+    fill(packed, targets)
+    return recording.vary(packed, lambda packed, inputs: fill(packed, inputs.targets))
