@@ -1,7 +1,8 @@
 """Copies a scene of the PanopticSports layout, with some train cameras as those of the test split.
 
 So options can be compared on views that nothing was trained on, without looking at the real test
-split. Pictures that nobody asks for are not copied.
+split. Pictures that nobody asks for are not copied; masks of what moves are, by which ``eval``
+tells the moving pixels from the others.
 
 python tests/training/fewer_cameras.py SCENE OUT --held 4 11 18 26 --moments 1
 """
@@ -25,6 +26,12 @@ def part(document: dict[str, Any], cameras: set[int], moments: int) -> dict[str,
     return {"w": document["w"], "h": document["h"], **chosen}
 
 
+def copy(source: Path, target: Path) -> None:
+    """Copy a file, with the folders that it lies in."""
+    target.parent.mkdir(parents=True, exist_ok=True)
+    shutil.copy(source, target)
+
+
 def main() -> None:
     """Write the scene."""
     asked = argparse.ArgumentParser(description=__doc__)
@@ -41,8 +48,10 @@ def main() -> None:
     for name, cameras in (("train", known - held), ("test", held)):
         own = part(document, cameras, args.moments)
         for file in (file for moment in own["fn"] for file in moment):
-            (args.out / "ims" / file).parent.mkdir(parents=True, exist_ok=True)
-            shutil.copy(args.scene / "ims" / file, args.out / "ims" / file)
+            copy(args.scene / "ims" / file, args.out / "ims" / file)
+            mask = Path("seg") / Path(file).with_suffix(".png")
+            if (args.scene / mask).is_file():
+                copy(args.scene / mask, args.out / mask)
         (args.out / f"{name}_meta.json").write_text(json.dumps(own), encoding="utf-8")
         print(f"{name}: {len(cameras)} cameras, {len(own['fn'])} moments")
 
