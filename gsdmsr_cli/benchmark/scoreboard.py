@@ -18,6 +18,9 @@ COLUMNS = {
     "train_psnr": ".2f",
     "val_psnr": ".2f",
     "test_psnr": ".2f",
+    "psnr_fitted": ".2f",
+    "psnr_moving": ".2f",
+    "psnr_static": ".2f",
     "ssim": ".4f",
     "lpips_alex": ".4f",
     "fps": ".0f",
@@ -63,6 +66,9 @@ def _values(document: Mapping[str, Any]) -> dict[str, float | None]:
     return {
         "psnr": aggregate["psnr"],
         **{f"{split}_psnr": splits.get(split, {}).get("psnr") for split in SPLITS},
+        **{
+            f"psnr_{what}": aggregate.get(f"psnr_{what}") for what in ("fitted", "moving", "static")
+        },
         "ssim": aggregate["ssim"],
         "lpips_alex": aggregate["lpips_alex"]["value"],
         **{name: document["speed"][name] for name in ("fps", "fps_raster")},

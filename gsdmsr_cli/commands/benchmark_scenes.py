@@ -21,7 +21,7 @@ from gsdmsr_cli.ground.limits import cores
 
 SCHEMA = 1
 
-WIDTH = 200
+WIDTH = 230
 """Columns of text for the table: a narrow terminal had better wrap lines than fold cells."""
 
 

@@ -17,7 +17,13 @@ def trial(scene: str, preset: str = "dnerf", seed: int = 0) -> Trial:
 
 def document(psnr: float | None, lpips: float | None = 0.25) -> dict[str, Any]:
     return {
-        "aggregate": {"psnr": psnr, "ssim": 0.5, "lpips_alex": {"value": lpips}},
+        "aggregate": {
+            "psnr": psnr,
+            "psnr_fitted": 31.0,
+            "psnr_moving": 25.0,
+            "ssim": 0.5,
+            "lpips_alex": {"value": lpips},
+        },
         "splits": {"test": {"psnr": psnr}, "train": {"psnr": 40.0}},
         "speed": {"fps": 100.0, "fps_raster": 150.0},
         "storage": {"splats_bytes": 2_000_000, "motion_bytes": 500_000, "training_state_bytes": 7},
@@ -29,7 +35,8 @@ def test_a_single_trial() -> None:
     (row,) = rows_of([(trial("lego"), document(30.0))])
     assert row == {
         "scene": "lego", "preset": "dnerf", "length": "2m", "trials": 1, "psnr": 30.0,
-        "spread": None, "train_psnr": 40.0, "val_psnr": None, "test_psnr": 30.0, "ssim": 0.5,
+        "spread": None, "train_psnr": 40.0, "val_psnr": None, "test_psnr": 30.0,
+        "psnr_fitted": 31.0, "psnr_moving": 25.0, "psnr_static": None, "ssim": 0.5,
         "lpips_alex": 0.25, "fps": 100.0, "fps_raster": 150.0,
         "model_mb": 2.5, "splats": 10, "steps": 200, "ms_per_step": 25.0,
         "peak_mib": 300.0,
@@ -77,6 +84,9 @@ def test_the_table_has_a_line_for_every_row(count: int) -> None:
         "40.00",
         "",
         "30.00",
+        "31.00",
+        "25.00",
+        "",
         "0.5000",
         "0.2500",
         "100",
