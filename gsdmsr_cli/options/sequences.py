@@ -19,6 +19,9 @@ class StreamOptions:
         steps: length of every moment after the first [steps], unless there is a budget.
         budget: its length as wall time, such as "10s"; null counts steps.
         extrapolate: share of the last velocity with which a moment begins, 0 to 1.
+        changed: mean difference from the picture of the moment before from which on a block of
+            pixels counts as changed [range of colours]; tiles that have none are left out of most
+            steps, and so are views that have few. 0 looks at all.
         ssim: weight of SSIM at moments after the first, in place of ``losses.ssim``: what is learnt
             there is where splats go, and absolute differences alone tell that better.
         rigidity: weight of how far neighbouring splats are from moving as a rigid body, from one
@@ -37,6 +40,7 @@ class StreamOptions:
     steps: int = 200
     budget: str | None = None
     extrapolate: float = 1.0
+    changed: float = 0.0
     ssim: float = 0.0
     rigidity: float = 0.05
     rotation_similarity: float = 0.2
@@ -53,6 +57,7 @@ class StreamOptions:
             require(self, key, getattr(self, key) >= 0, "0 or more")
         require_duration(self, "budget")
         require(self, "extrapolate", 0.0 <= self.extrapolate <= 1.0, "0 to 1")
+        require(self, "changed", 0.0 <= self.changed < 1.0, "0 or more, below 1")
         require(self, "ssim", 0.0 <= self.ssim <= 1.0, "a weight from 0 to 1")
         for key in ("place_step", "turn_step"):
             require(self, key, 1e-7 <= getattr(self, key) <= 0.1, "1e-7 to 0.1")

@@ -271,14 +271,18 @@ class Trainer:
                 return row
 
     def _order(self, row: int, progress: float) -> Order:
-        view, weights, jitter = self.views[row], None, 0.0
-        tiles = self.renderer.tiles(view, progress, self.frozen)
-        if 0 < self.tiles.count < tiles:
-            weights = self.tiles.choose(row, tiles, self.generator)
+        view, jitter = self.views[row], 0.0
+        weights = self._weights(row, self.renderer.tiles(view, progress, self.frozen))
         if self.model.needs_jitter:
             jitter = float(torch.randn((), generator=self.generator))
         others = self.renderer.other_times(view, self._times, self.generator)
         return Order(row, weights, jitter, others, self.renderer.seed(self.generator))
+
+    def _weights(self, row: int, tiles: int) -> Tensor | None:
+        """Return the weights of a view's tiles, None for the whole picture; 0 tiles have none."""
+        if 0 < self.tiles.count < tiles:
+            return self.tiles.choose(row, tiles, self.generator)
+        return None
 
     def _penalty(self, order: Order, progress: float) -> Penalty | None:
         """Return the layers' regularisers, evaluated for one view, and their gradients."""
@@ -312,8 +316,9 @@ class Trainer:
         """
         for order, view in zip(orders, views, strict=True):
             weights, errors = order.tile_weights, view.tile_errors
-            # errors are waited for, so the loss may be as well
-            if weights is not None and errors is not None and bool(loss.isfinite()):
+            if not self.tiles.count or weights is None or errors is None:
+                continue
+            if bool(loss.isfinite()):  # errors are waited for, so the loss may be as well
                 self.tiles.learn(order.row, weights, errors.cpu())
         if progress < self.preset.density.until:
             self._observe(views, loss)

@@ -121,7 +121,7 @@ class TrainingRenderer:
         return [self._alone(model, look, phase) for look in looks]
 
     def _look(self, model: Model, order: Order, phase: Phase) -> _Look:
-        pictures, view = self._pictures(phase.progress), self.views[order.row]
+        pictures, view = self.pictures_at(phase.progress), self.views[order.row]
         recorded, weights = pictures.camera(view), self._weights(phase)
         instant, camera = model.instant_of_view(view.time, recorded, order.jitter)
         times = order.other_times or [None] * len(self.terms)
@@ -291,9 +291,10 @@ class TrainingRenderer:
 
     def camera(self, view: View, progress: float) -> Camera:
         """Return the camera that a view is rendered under."""
-        return self._pictures(progress).camera(view)
+        return self.pictures_at(progress).camera(view)
 
-    def _pictures(self, progress: float) -> Pictures | HalvedPictures:
+    def pictures_at(self, progress: float) -> Pictures | HalvedPictures:
+        """Return the pictures that views are compared with, of half the size at first."""
         if progress < self.preset.training.low_resolution_until:
             return self._halved
         self._halved.release()

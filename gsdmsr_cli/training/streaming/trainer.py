@@ -28,6 +28,7 @@ from gsdmsr_cli.training.gradients.phase import Order, ViewGradients
 from gsdmsr_cli.training.population import Tick
 from gsdmsr_cli.training.ranks.alone import ALONE, Ranks
 from gsdmsr_cli.training.resizing import Resize
+from gsdmsr_cli.training.streaming.changes import Changes
 from gsdmsr_cli.training.streaming.clock import StreamClock
 from gsdmsr_cli.training.streaming.noticing import Look, find_places, look
 from gsdmsr_cli.training.streaming.shots import Shot, first_shot, shots_of
@@ -74,6 +75,7 @@ class StreamTrainer(Trainer):
         self.clock.measure(preset)
         self.settled, self._placed = False, False
         self._stiffness = Stiffness(preset.stream)
+        self._changes = Changes(preset.stream.changed, self.views, pictures)
         self._see()
 
     @property
@@ -162,6 +164,8 @@ class StreamTrainer(Trainer):
         """Look at the present moment."""
         self.queue = []
         self._times = [shot.time for shot in self.shots[: self.clock.moment + 1]]
+        before = self.shots[self.clock.moment - 1].rows if self.clock.moment else ()
+        self._changes.begin(self.shot.rows, before)
 
     def _most_splats(self) -> int:
         return super()._most_splats() + self._newcomers_count
@@ -175,12 +179,25 @@ class StreamTrainer(Trainer):
         self.model.advance(progress)
 
     def _next_row(self, progress: float) -> int:
-        """Return the next view of a random order that visits all of the moment before any again."""
+        """Return the next view of a random order that visits all of the moment before any again.
+
+        Views in which little has changed are left out now and then.
+        """
         rows = self.shot.rows
-        if not self.queue:
-            order = torch.randperm(len(rows), generator=self.generator)
-            self.queue = [rows[i] for i in order.tolist()]
-        return self.queue.pop()
+        while True:
+            if not self.queue:
+                order = torch.randperm(len(rows), generator=self.generator)
+                self.queue = [rows[i] for i in order.tolist()]
+            row = self.queue.pop()
+            if not self._changes or self._changes.wants(row, rows, self.generator):
+                return row
+
+    def _weights(self, row: int, tiles: int) -> Tensor | None:
+        """Return the weights of tiles: those that have not changed are left out."""
+        if not (self._changes and tiles and self.frozen):
+            return super()._weights(row, tiles)
+        pictures = self.renderer.pictures_at(self.clock.progress)
+        return self._changes.weights(row, pictures, self.generator)
 
     def _penalty(self, order: Order, progress: float) -> Penalty | None:
         """Return how far neighbours are from moving together, and its gradients."""

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from gsdmsr_cli.backends.cpu.jit import threads
 from gsdmsr_cli.ground.splatting_constants import ALPHA_MIN, TILE
 from gsdmsr_cli.ops.rasterize.cpu import projection
-from gsdmsr_cli.ops.rasterize.cpu.binning import Bins, bin_splats, depth_order
+from gsdmsr_cli.ops.rasterize.cpu.binning import Bins, bin_splats, depth_order, leave_out
 
 WIDTHS = [1, 15, 16, 17, 33, 50]
 
@@ -41,6 +41,15 @@ def projected(
         means2d, conics, depths, opacities, radii, tiles,
     )  # fmt: skip
     return means2d, conics, depths, opacities, tiles
+
+
+def radii_of(screen: Screen) -> NDArray[np.float32]:
+    """Return the half extents (N,) that ``project`` gives, 0 for splats that are not drawn."""
+    _, conics, _, opacities, _ = (x.astype(np.float64) for x in screen)
+    extent = 2 * np.log(np.maximum(opacities / ALPHA_MIN, 1))
+    a, b, c = conics.T
+    det = np.where(opacities > 0, a * c - b * b, 1)
+    return np.sqrt(extent * np.maximum(a, c) / det).astype(np.float32)
 
 
 def alphas(screen: Screen, width: int, height: int) -> NDArray[np.float64]:
@@ -156,3 +165,25 @@ def test_lists_do_not_depend_on_the_number_of_threads() -> None:
         numba.set_num_threads(before)
     for one, two in zip(*found, strict=True):
         assert np.array_equal(one, two)
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.sampled_from(WIDTHS), st.sampled_from(WIDTHS), st.integers(0, 2**16), st.floats(0, 1))
+def test_only_splats_that_touch_no_tile_with_a_weight_are_left_out(
+    width: int, height: int, seed: int, share: float
+) -> None:
+    screen = projected(60, width, height, seed, size=0.03)
+    columns, rows = -(-width // TILE), -(-height // TILE)
+    draws = np.random.default_rng(seed).random(rows * columns)
+    weights = np.where(draws < share, 3.0, 0).astype(np.float32)
+    wanted = np.repeat(np.repeat(weights.reshape(rows, columns) > 0, TILE, 0), TILE, 1)
+    needed = (alphas(screen, width, height) >= ALPHA_MIN) & wanted[:height, :width]
+    means2d, _, _, opacities, tiles = (x.copy() for x in screen)
+    leave_out(means2d, radii_of(screen), width, height, weights, opacities, tiles)
+    left = (screen[4] > 0) & (tiles == 0)
+    assert not (left & needed.any(axis=(1, 2))).any()
+    assert (opacities[left] == 0).all() and (tiles[~left] == screen[4][~left]).all()
+    if not (weights > 0).any():
+        assert not tiles.any()
+    if (weights > 0).all():
+        assert not left.any()

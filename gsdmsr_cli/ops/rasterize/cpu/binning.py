@@ -174,6 +174,33 @@ def _scatter(pairs, order_size, chunks, bounds, listed, heads, entries):
 
 
 @serial
+def leave_out(means2d, radii, width, height, tile_weights, opacities, tiles):
+    """Do not draw splats whose box lies in tiles of weight 0 alone: nothing is asked of them.
+
+    Args:
+        means2d, radii, width, height: see ``projection.project``.
+        tile_weights: (tiles,) float32.
+        opacities: (N,) in and out, 0 where the splat is not drawn.
+        tiles: (N,) int32 in and out, likewise.
+    """
+    columns, rows = (width + TILE - 1) // TILE, (height + TILE - 1) // TILE
+    counts = np.zeros((rows + 1, columns + 1), np.int32)  # of those with a weight, up and left
+    for row in range(rows):
+        for column in range(columns):
+            own = np.int32(tile_weights[row * columns + column] > 0)
+            before = counts[row, column + 1] + counts[row + 1, column] - counts[row, column]
+            counts[row + 1, column + 1] = before + own
+    for i in range(tiles.shape[0]):
+        if tiles[i] == 0:
+            continue
+        left, right = pixel_range(means2d[i, 0], radii[i], width)
+        top, bottom = pixel_range(means2d[i, 1], radii[i], height)
+        x0, x1, y0, y1 = left // TILE, right // TILE + 1, top // TILE, bottom // TILE + 1
+        if counts[y1, x1] - counts[y0, x1] - counts[y1, x0] + counts[y0, x0] == 0:
+            opacities[i], tiles[i] = float32(0), 0
+
+
+@serial
 def assign(means2d, conics, depths, opacities, tiles, width, height, chunks):
     """Return what ``bin_splats`` does, as a plain tuple; ``chunks`` is the number of threads."""
     order = depth_order(depths, tiles)

@@ -10,7 +10,7 @@ import numpy as np
 from gsdmsr_cli.backends.cpu.jit import serial
 from gsdmsr_cli.ground.splatting_constants import TILE
 from gsdmsr_cli.ops.photometric.cpu import compare
-from gsdmsr_cli.ops.rasterize.cpu.binning import assign
+from gsdmsr_cli.ops.rasterize.cpu.binning import assign, leave_out
 from gsdmsr_cli.ops.rasterize.cpu.blending import (
     PARTS,
     RECORD,
@@ -45,6 +45,8 @@ def look(
         means, quats, log_scales, logit_opacities, sh, axes, view, intrinsics, width, height,
         means2d, conics, depths, opacities, radii, tiles,
     )  # fmt: skip
+    if tile_weights.shape[0] > 0:
+        leave_out(means2d, radii, width, height, tile_weights, opacities, tiles)
     colours = np.empty((n, 3), np.float32)
     colour(means, sh, terms, centre, opacities, colours)
     entries, starts, busiest, order = assign(
