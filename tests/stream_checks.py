@@ -25,7 +25,7 @@ OPTIONS = (
 )  # fmt: skip
 
 
-WAYS = "persistent", "hicom", "3dgstream"
+WAYS = "persistent", "hicom", "scale-gs", "3dgstream"
 """Presets of streams."""
 
 NEWCOMERS = "layers=[{name: exposure}, {name: newcomers, count: 30}]"

@@ -89,7 +89,10 @@ def test_other_commands_take_it_as_any_run(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     way, run = any_run
-    motions = {"persistent": "tracks", "hicom": "cells", "3dgstream": "transformation_cache"}
+    motions = {
+        "persistent": "tracks", "hicom": "cells", "scale-gs": "cells",
+        "3dgstream": "transformation_cache",
+    }  # fmt: skip
     assert gsdmsr("info", run, "--json") == 0
     facts = json.loads(capsys.readouterr().out)["facts"]
     assert facts["motion"] == motions[way] and facts["moments"] == f"{MOMENTS} of {MOMENTS}"

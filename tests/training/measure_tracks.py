@@ -4,7 +4,7 @@ A ring of 16 cameras films the ray-traced room, of which two things are known at
 goes with the splat that counts most where it was at the first moment, as in Dynamic 3D Gaussians
 (Luiten et al., 3DV 2024, section 4): at its place in the splat's own axes.
 
-python tests/training/measure_tracks.py OUT [--seeds 0 1 2] [--ways persistent hicom 3dgstream]
+python tests/training/measure_tracks.py OUT [--seeds 0 1 2] [--ways hicom ...]
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 import numpy as np
 import torch
 from moving_room import THINGS, Floats, Thing, write_rig
-from stream_checks import each_moment, psnr_of
+from stream_checks import WAYS, each_moment, psnr_of
 
 from gsdmsr_cli.formats import read_scene
 from gsdmsr_cli.gaussians.splats import Splats
@@ -112,7 +112,7 @@ def main() -> None:
     asked.add_argument("--steps", type=int, default=2000, help="of the first moment")
     asked.add_argument("--later", type=int, default=60, help="steps of each later one")
     asked.add_argument("--seeds", type=int, nargs="+", default=[0])
-    asked.add_argument("--ways", nargs="+", default=["persistent", "hicom", "3dgstream"])
+    asked.add_argument("--ways", nargs="+", default=WAYS)
     asked.add_argument("--set", dest="options", metavar="KEY=VALUE", action="append", default=[])
     args = asked.parse_args()
     torch.set_num_threads(1)

@@ -1,6 +1,6 @@
 """Prints what newcomers are worth in a stream into which a ball comes at the third of six moments.
 
-python tests/training/measure_visitor.py OUT [--seeds 0 1 2] [--ways persistent hicom 3dgstream]
+python tests/training/measure_visitor.py OUT [--seeds 0 1 2] [--ways hicom ...]
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from rigs import write_rig
-from stream_checks import each_moment, psnr_of
+from stream_checks import WAYS, each_moment, psnr_of
 
 from gsdmsr_cli.formats import read_scene
 from gsdmsr_cli.options.preset import load_preset
@@ -42,7 +42,7 @@ def main() -> None:
     asked = argparse.ArgumentParser(description=__doc__)
     asked.add_argument("out", type=Path)
     asked.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
-    asked.add_argument("--ways", nargs="+", default=["persistent", "hicom", "3dgstream"])
+    asked.add_argument("--ways", nargs="+", default=WAYS)
     asked.add_argument("--counts", type=int, nargs="+", default=[0, 400])
     args = asked.parse_args()
     data = args.out / "visitor"

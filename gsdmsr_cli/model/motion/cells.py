@@ -3,7 +3,8 @@
 Hierarchical coherent motion (HiCoM: Gao et al., NeurIPS 2024): moment after moment, each cell of a
 few levels learns how it is displaced and turned, and a splat does what all cells that it is in do.
 Splats that share a motion are seen by more pixels, and a moment takes the bytes of its cells.
-Cells are halves of halves of the splats of the first moment, and the same at all moments.
+Cells are halves of halves of the splats of the first moment, and the same at all moments. Levels
+may join one after the other, the largest cells first, as in Scale-GS (Yang et al. 2025).
 """
 
 from __future__ import annotations
@@ -33,12 +34,15 @@ class Options:
 
     Attributes:
         splats: how many splats a cell has at most, from the largest cells to the smallest.
+        join: progress of a moment from which on each level learns, ascending; a number for each, or
+            none where all do from the start.
         rate: learning rate of the displacements at the start and the end of a moment [scene
             bounds].
         turn_rate: that of the rotations.
     """
 
     splats: tuple[int, ...] = (512, 64, 8)
+    join: tuple[float, ...] = ()
     rate: tuple[float, float] = (2e-3, 1e-4)
     turn_rate: tuple[float, float] = (4e-3, 2e-4)
 
@@ -47,6 +51,10 @@ class Options:
         require(self, "splats", bool(self.splats) and falls, "one number or more, which descend")
         require(self, "splats", not self.splats or self.splats[-1] >= 1, "1 or more each")
         require_rates(self, "rate", "turn_rate")
+        number = len(self.join) in (0, len(self.splats))
+        require(self, "join", number, f"a progress for each of the {len(self.splats)} levels")
+        rises = all(0 <= a <= b < 1 for a, b in pairwise((0.0, *self.join)))
+        require(self, "join", rises, "ascending, each 0 or more, below 1")
 
 
 class Cells(Streamed):
@@ -66,6 +74,7 @@ class Cells(Streamed):
 
     def __init__(self, options: Options, facts: Facts, count: int) -> None:
         self.options = options
+        self._joined = len(options.splats)
         self.cells = torch.zeros(count, dtype=torch.int32)
         self.around, self.middles = torch.zeros(1, dtype=torch.int32), torch.zeros(1, 3)
         levels = len(options.splats)  # each of which has a cell for every splat, if it comes to it
@@ -78,10 +87,32 @@ class Cells(Streamed):
 
     def of_splats(self, means: Tensor, index: int) -> Knot:
         """Return what all cells that each splat is in do together."""
-        sums = self._with_larger(self._affine(self.knot(index)))
+        sums = self._with_larger(self._affine(self._learning(index)))
         axes, shifts, turns = sums.index_select(0, self.cells).split([9, 3, 4], dim=1)
         places = (means.detach() / self.bound)[:, None, :]
         return Knot((axes.unflatten(1, (3, 3)) * places).sum(dim=2) + shifts, turns)
+
+    def advance(self, progress: float) -> None:
+        """Let the levels learn whose time has come."""
+        join = self.options.join
+        self._joined = sum(progress >= own for own in join) if join else len(self.options.splats)
+
+    def _learning(self, index: int) -> Knot:
+        """Return the rows of a moment, those of levels that do not learn yet without gradients."""
+        rows, levels = self.knot(index), len(self.options.splats)
+        if self._joined == levels or not torch.is_grad_enabled():
+            return rows
+        learns = (self._levels() < self._joined)[:, None]
+        return Knot(*(torch.where(learns, own, own.detach()) for own in rows))
+
+    def _levels(self) -> Tensor:
+        """Return the level of each cell (C,), 0 of the largest."""
+        around = self.around.long()
+        place, found = torch.arange(len(around), device=around.device), torch.zeros_like(around)
+        for _ in range(len(self.options.splats) - 1):
+            found += place != around[place]
+            place = around[place]
+        return found
 
     def _affine(self, rows: Knot) -> Tensor:
         """Return A, b and turns (C, 16) of cells that displace by A x + b [scene bounds]."""

@@ -156,3 +156,27 @@ def test_what_does_not_fit_together_is_refused(name: str, wrong: Tensor, message
 def test_bad_options_are_named(options: dict[str, Any], message: str) -> None:
     with pytest.raises(UsageError, match=message):
         options_of("gsdmsr_cli.model.motion", {"name": "cells", **options})
+
+
+def test_levels_learn_from_their_time_on_the_largest_first() -> None:
+    splats = splats_of(COUNT)
+    cells = Cells(Options(splats=(20, 10, 5), join=(0.0, 0.25, 0.5)), FACTS, COUNT)
+    cells.settle(splats, first=True)
+    cells.go_on(0.0, 0.0, 1.0, 1.0)
+    levels = cells_of(splats.means.detach().numpy() / FACTS.bound, (20, 10, 5))
+    first = torch.tensor([levels[:, level].max() for level in range(3)]) + 1
+    for progress, joined in ((0.0, 1), (0.3, 2), (0.5, 3), (0.9, 3)):
+        cells.advance(progress)
+        (moved_by(cells, splats, 1.0).means ** 2).sum().backward()
+        with_gradient = cells.offsets.grad.abs().sum(dim=1) > 0
+        assert with_gradient.sum() == first[joined - 1] and with_gradient[: first[joined - 1]].all()
+        cells.offsets.grad = None
+
+
+@pytest.mark.parametrize("join", [(0.0, 0.5), (0.0, 0.5, 0.4), (0.0, 0.5, 1.0), (-0.1, 0.0, 0.1)])
+def test_times_of_joining_that_do_not_fit_are_refused(join: tuple[float, ...]) -> None:
+    with pytest.raises(UsageError, match=r"motion: join is .*; allowed: "):
+        options_of(
+            "gsdmsr_cli.model.motion",
+            {"name": "cells", "splats": [20, 10, 5], "join": list(join)},
+        )

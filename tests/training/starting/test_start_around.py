@@ -28,7 +28,7 @@ def test_a_rig_around_starts_in_the_box_where_the_preset_says_so() -> None:
             initial_splats(*other, *given)
 
 
-@pytest.mark.parametrize("name", ["n3v", "persistent", "hicom", "3dgstream"])
+@pytest.mark.parametrize("name", ["n3v", "persistent", "hicom", "scale-gs", "3dgstream"])
 def test_presets_for_rigs_look_how_cameras_stand(name: str) -> None:
     splats = load_preset(name, None, []).splats
     assert splats.start == "surfaces" and splats.start_around in {"box", "silhouettes"}
