@@ -2,8 +2,8 @@
 
     python docs/pictures/beside.py OUT.webp VIEW[,VIEW...] RUN RUN...
 
-A row for each view, by the name that it has in the report, at half the size; all runs are of the
-same data and size.
+A row for each view, by the name that it has in the report; wide pictures at half the size. All runs
+are of the same data and size.
 """
 
 from __future__ import annotations
@@ -23,6 +23,9 @@ from gsdmsr_cli.scene.native import cv2
 QUALITY = 75
 """Of WebP, 0 to 100."""
 
+WIDE = 480
+"""Width of a picture above which it is shown at half its size [px]."""
+
 
 def main(out: Path, names: list[str], runs: list[Path]) -> None:
     """Write the picture."""
@@ -34,9 +37,10 @@ def main(out: Path, names: list[str], runs: list[Path]) -> None:
             drawn = [one.renderer.draw(views[name]) for one in opened]
             rows.append([_eight_bits(p) for p in (*drawn, opened[0].renderer.true(views[name]))])
     pixels = np.concatenate([np.concatenate(row, axis=1) for row in rows])
-    height, width = pixels.shape[0] // 2, pixels.shape[1] // 2
-    halved = cv2.resize(pixels, (width, height), interpolation=cv2.INTER_AREA)
-    out.write_bytes(encode_webp(np.asarray(halved, np.uint8), QUALITY))
+    if pixels.shape[1] > WIDE * (len(runs) + 1):
+        size = pixels.shape[1] // 2, pixels.shape[0] // 2
+        pixels = np.asarray(cv2.resize(pixels, size, interpolation=cv2.INTER_AREA), np.uint8)
+    out.write_bytes(encode_webp(pixels, QUALITY))
 
 
 def _eight_bits(picture: Tensor) -> NDArray[np.uint8]:

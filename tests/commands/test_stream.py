@@ -45,6 +45,12 @@ def run(rig: Path, tmp_path: Path, gsdmsr: Gsdmsr) -> Path:
     return tmp_path / "run"
 
 
+MOTIONS = {
+    "persistent": "tracks", "hicom": "cells", "scale-gs": "cells",
+    "3dgstream": "transformation_cache",
+}  # fmt: skip
+
+
 @pytest.fixture(params=[*WAYS, "newcomers"])
 def any_run(
     rig: Path, tmp_path: Path, gsdmsr: Gsdmsr, request: pytest.FixtureRequest
@@ -89,20 +95,16 @@ def test_other_commands_take_it_as_any_run(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     way, run = any_run
-    motions = {
-        "persistent": "tracks", "hicom": "cells", "scale-gs": "cells",
-        "3dgstream": "transformation_cache",
-    }  # fmt: skip
     assert gsdmsr("info", run, "--json") == 0
     facts = json.loads(capsys.readouterr().out)["facts"]
-    assert facts["motion"] == motions[way] and facts["moments"] == f"{MOMENTS} of {MOMENTS}"
+    assert facts["motion"] == MOTIONS[way] and facts["moments"] == f"{MOMENTS} of {MOMENTS}"
     assert gsdmsr("eval", run, "--json") == 0
     document = json.loads(capsys.readouterr().out)
     assert len(document["frames"]) == MOMENTS
     sizes = [moments.path_of(run, moment).stat().st_size for moment in range(MOMENTS)]
     assert document["storage"]["checkpoint_bytes"] == sum(sizes)
     first = moments.read(run, 0).tensors
-    assert any(name.startswith("motion.") for name in first) == (way == "hicom")
+    assert any(name.startswith("motion.") for name in first) == (MOTIONS[way] == "cells")
     own = sum(tensor.nbytes for name, tensor in first.items() if not name.startswith("splats."))
     assert document["storage"]["motion_bytes"] == own + sum(sizes[1:])
     film = "--path", "still", "--view", "train/c0_000", "--frames", 2
@@ -126,13 +128,14 @@ def test_what_is_read_is_what_was_trained_but_for_rounding(any_run: tuple[str, P
     assert (before - trained["motion.past_offsets"][:, 0]).abs().max() <= step / 2 + 1e-6
     assert torch.equal(model.splats.sh, trained["splats.sh"])
     rows = len(model.tensors()["motion.offsets"])
-    assert (rows < len(model.splats)) == (way == "hicom")
+    assert (rows < len(model.splats)) == (MOTIONS[way] == "cells")
     preset = opened.preset
     whole = load_model(trained, preset.motion, preset.layers, opened.facts, progress=1.0)
     found, true = (own.at(own.instant(1.0)).splats for own in (model, whole))
     assert not torch.equal(true.means, model.splats.means)
     near = step / 2 * opened.facts.bound + 1e-5
-    if way == "hicom":  # a cell's turn is off by as much, and moves what is far from its middle
+    if MOTIONS[way] == "cells":
+        # a cell's turn is off by as much, and moves what is far from its middle
         arm = (model.splats.means - model.splats.means.mean(dim=0)).norm(dim=1).max()
         near = len(Options().splats) * (near + 2 * preset.stream.turn_step * float(arm))
     assert (found.means - true.means).abs().max() <= near
