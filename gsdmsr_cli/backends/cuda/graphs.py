@@ -42,6 +42,13 @@ class Recording(Generic[T]):
         self._nodes: list[_Node] = []
         self._results: T
 
+    def listens(self) -> bool:
+        """Return whether this thread works on the stream that is captured.
+
+        Autograd's does; one that draws what a page shows does not.
+        """
+        return torch.cuda.is_current_stream_capturing()
+
     def vary(self, structure: ctypes.Structure, fill: recording.Fill) -> None:
         """See ``recording.vary``.
 

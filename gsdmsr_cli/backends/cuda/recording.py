@@ -46,6 +46,9 @@ class Followed(Protocol):
 class Recorder(Protocol):
     """Who listens while work is recorded."""
 
+    def listens(self) -> bool:
+        """Return whether what this thread does now is part of the work, and not beside it."""
+
     def vary(self, structure: ctypes.Structure, fill: Fill) -> None:
         """See ``vary``."""
 
@@ -65,7 +68,7 @@ _recorder: Recorder | None = None
 
 @contextmanager
 def recorded_by(recorder: Recorder) -> Iterator[None]:
-    """Let a recorder listen, to all threads, until the block ends."""
+    """Let a recorder listen until the block ends, on whatever thread the work goes on."""
     global _recorder
     before, _recorder = _recorder, recorder
     try:
@@ -74,9 +77,14 @@ def recorded_by(recorder: Recorder) -> Iterator[None]:
         _recorder = before
 
 
+def _listening() -> Recorder | None:
+    recorder = _recorder
+    return recorder if recorder is not None and recorder.listens() else None
+
+
 def is_recording() -> bool:
     """Return whether anybody listens."""
-    return _recorder is not None
+    return _listening() is not None
 
 
 def vary(structure: S, fill: Fill) -> S:
@@ -84,25 +92,25 @@ def vary(structure: S, fill: Fill) -> S:
 
     To be called before it is given to a kernel. The structure stays the same object.
     """
-    if _recorder is not None:
-        _recorder.vary(structure, fill)
+    if (recorder := _listening()) is not None:
+        recorder.vary(structure, fill)
     return structure
 
 
 def keep(tensor: Tensor) -> Tensor:
     """Return a tensor that is read, and belongs neither to the model nor to the work itself."""
-    if _recorder is not None:
-        _recorder.keep(tensor)
+    if (recorder := _listening()) is not None:
+        recorder.keep(tensor)
     return tensor
 
 
 def follow(what: Followed) -> None:
     """Let something be asked before, and told after every replay."""
-    if _recorder is not None:
-        _recorder.follow(what)
+    if (recorder := _listening()) is not None:
+        recorder.follow(what)
 
 
 def tell(launched: Callable[[], Launched]) -> None:
     """Tell of a launch, if anybody listens."""
-    if _recorder is not None:
-        _recorder.launched(launched())
+    if (recorder := _listening()) is not None:
+        recorder.launched(launched())

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import gc
+import threading
 from contextlib import nullcontext
 from typing import Any
 
@@ -50,6 +51,10 @@ def recorder(fake: ctypes.CDLL, monkeypatch: pytest.MonkeyPatch) -> graphs.Graph
     monkeypatch.setattr(torch.cuda, "stream", lambda stream: nullcontext())
     monkeypatch.setattr(torch.cuda, "current_stream", Stream)
     monkeypatch.setattr(torch.cuda, "graph_pool_handle", lambda: "pool")
+    main = threading.current_thread()
+    monkeypatch.setattr(
+        torch.cuda, "is_current_stream_capturing", lambda: threading.current_thread() is main
+    )
     zeros = torch.zeros
     monkeypatch.setattr(torch, "zeros", lambda *size, device=None, **more: zeros(*size, **more))
     made = graphs.GraphRecorder(CARD)
@@ -113,6 +118,23 @@ def test_no_garbage_is_collected_while_a_stream_is_captured(
     found = []
     recorder.record(lambda: found.append(gc.isenabled()), None)
     assert found == [True, False] and gc.isenabled()
+
+
+def test_what_another_thread_does_meanwhile_is_no_part_of_it(
+    recorder: graphs.GraphRecorder, fake: ctypes.CDLL
+) -> None:
+    """Such as drawing what a page shows."""
+    beside = Work()
+
+    def work() -> None:
+        thread = threading.Thread(target=beside)
+        thread.start()
+        thread.join()
+
+    made = recorder.record(work, 7.0)  # which is not what the other thread's structure holds
+    assert beside.done == 2 and "ask" not in seen(fake)
+    made.replay(8.0)
+    assert [what for what in seen(fake) if what != "enter"] == [EXECUTE]
 
 
 def test_an_error_of_the_work_is_told_and_not_that_of_the_capture(

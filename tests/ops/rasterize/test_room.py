@@ -90,6 +90,9 @@ class Followed:
     def __init__(self) -> None:
         self.lists: list[recording.Followed] = []
 
+    def listens(self) -> bool:
+        return True
+
     def follow(self, what: recording.Followed) -> None:
         self.lists.append(what)
 

@@ -36,6 +36,9 @@ class Refilled:
     def __init__(self, inputs: ViewInputs) -> None:
         self.inputs, self.launches, self.filled = inputs, 0, 0
 
+    def listens(self) -> bool:
+        return True
+
     def vary(self, structure: ctypes.Structure, fill: recording.Fill) -> None:
         self.filled += 1
         fill(structure, self.inputs)
