@@ -134,15 +134,7 @@ class GraphRecorder:
 
     def __init__(self, device: torch.device) -> None:
         self._device, self._driver = device, launch.driver()
-        self._stream = torch.cuda.Stream(device)
-        self._pool = torch.cuda.graph_pool_handle()
-        self._anchor = torch.cuda.CUDAGraph()  # a pool that no graph has is gone
-        with torch.cuda.stream(self._stream):
-            some = torch.zeros(1, device=device)
-            self._anchor.capture_begin(pool=self._pool)
-            some.add_(1)
-            self._anchor.capture_end()
-        self._warm = False
+        self._place: _Place | None = None
 
     def record(self, work: Callable[[], T], inputs: Any) -> Recording[T]:
         """Record what ``work`` launches, whose present inputs these are.
@@ -152,23 +144,43 @@ class GraphRecorder:
             RuntimeError: torch cannot capture it.
             GsdmsrError: the driver refuses.
         """
-        if not self._warm:
-            self._warm_up(work)
+        if self._place is None:
+            place = _Place(self._device)
+            place.warm_up(work)
+            self._place = place
         made: Recording[T] = Recording(self._driver, self._device, inputs)
-        made.capture(work, self._stream, self._pool)
+        made.capture(work, self._place.stream, self._place.pool)
         return made
 
-    def _warm_up(self, work: Callable[[], object]) -> None:
+
+class _Place:
+    """Where work is captured.
+
+    Attributes:
+        stream: beside torch's own.
+        pool: of memory, for all recordings.
+    """
+
+    def __init__(self, device: torch.device) -> None:
+        self._device, self.stream = device, torch.cuda.Stream(device)
+        self.pool = torch.cuda.graph_pool_handle()
+        self._anchor = torch.cuda.CUDAGraph()  # a pool that no graph has is gone
+        with _no_garbage_collected(), torch.cuda.stream(self.stream):
+            some = torch.zeros(1, device=device)
+            self._anchor.capture_begin(pool=self.pool, capture_error_mode="thread_local")
+            some.add_(1)
+            self._anchor.capture_end()
+
+    def warm_up(self, work: Callable[[], object]) -> None:
         """Do the work once where it will be captured, so that libraries have made what they need.
 
         What they take while they are captured would belong to that recording.
         """
         now = torch.cuda.current_stream(self._device)
-        self._stream.wait_stream(now)
-        with torch.cuda.stream(self._stream):
+        self.stream.wait_stream(now)
+        with torch.cuda.stream(self.stream):
             work()
-        now.wait_stream(self._stream)
-        self._warm = True
+        now.wait_stream(self.stream)
 
 
 def can_record() -> bool:
