@@ -7,7 +7,7 @@ field.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Hashable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -88,6 +88,10 @@ class Layer(ABC):
         shades: whether ``shade`` does anything.
         holds_views: whether it holds something of each picture of the capture, and does nothing
             where none of these is drawn.
+        constants: names of the attributes that ``at_instants`` reads beside parameters and times,
+            and that may change as it trains. While they stay the same a GPU may replay its
+            launches, for which all times are to be read as ``recording.vary`` has it; None if they
+            are not.
     """
 
     identity_at_start: bool = True
@@ -97,6 +101,7 @@ class Layer(ABC):
     needs_jitter: bool = False
     shades: ClassVar[bool] = False
     holds_views: ClassVar[bool] = False
+    constants: ClassVar[Sequence[str] | None] = None
 
     def __init__(self, parameters: Sequence[Parameter] = ()) -> None:
         self._parameters = tuple(parameters)
@@ -223,14 +228,6 @@ class Layer(ABC):
             the names of the parameters that have new values.
         """
         return ()
-
-    def constants(self) -> Hashable | None:
-        """Return what else than parameters and times ``at_instants`` hangs on, while it trains.
-
-        A step that was recorded on a GPU is replayed while that stays the same. All times are to
-        be read as ``recording.vary`` has it. None if the layer cannot be recorded.
-        """
-        return None
 
     def following(self) -> Following | None:
         """Return what splats follow, if this layer does no more than let them follow it."""

@@ -259,10 +259,12 @@ class Model:
         """
         if self.needs_camera or self.needs_jitter or self.holds_views or self.shades:
             return None
-        own = tuple(layer.constants() for layer in self.layers.values())
-        if None in own:
-            return None
-        return len(self.splats), self.moving, self.precision, own
+        own: list[object] = [len(self.splats), self.moving, self.precision]
+        for layer in self.layers.values():
+            if layer.constants is None:
+                return None
+            own += (getattr(layer, name) for name in layer.constants)
+        return tuple(own)
 
     def penalty(self, instant: Instant, generator: torch.Generator) -> Tensor | None:
         """Return the sum of the layers' regularisers at ``instant``, or None if there are none."""

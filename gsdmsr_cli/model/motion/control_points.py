@@ -10,7 +10,7 @@ each of which moves its neighbourhood as a rigid body, has less freedom to do so
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -73,6 +73,8 @@ class Options:
 class ControlPointMotion(ControlPoints):
     """Control points with radii, whose displacement, rotation and scaling a plane grid gives."""
 
+    constants = ()
+
     def __init__(self, options: Options, facts: Facts, generator: torch.Generator) -> None:
         super().__init__(options.count, options.neighbours, facts, generator)
         self.options = options
@@ -104,10 +106,6 @@ class ControlPointMotion(ControlPoints):
 
     def _on_grid(self, time: float) -> float:
         return planes.evenly(self._place(time))
-
-    def constants(self) -> Hashable:
-        """Return nothing: whatever is read is a parameter, or hangs on the time alone."""
-        return ()
 
     def penalty(self, moment: Moment, instant: Instant, generator: torch.Generator) -> Tensor:
         """Return the plane regularisers, and the rigidity of control points at a random time.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -53,6 +53,8 @@ class Options:
 class HexPlaneMotion(Layer):
     """x, q and log s plus offsets read from one grid of several levels (4D-GS, section 4)."""
 
+    constants = ()
+
     def __init__(self, options: Options, facts: Facts, generator: torch.Generator) -> None:
         self.options, self.facts = options, facts
         times = time_nodes(facts.frames, options.time_ratio)
@@ -92,10 +94,6 @@ class HexPlaneMotion(Layer):
         *layers, last = self.layers
         self._own = self._own.to(last.weight.device)  # the model may have moved to a device
         return [*layers, network.Layer(last.weight * self._own, last.bias)]
-
-    def constants(self) -> Hashable:
-        """Return nothing: whatever is read is a parameter, or hangs on the time alone."""
-        return ()
 
     def penalty(self, moment: Moment, instant: Instant, generator: torch.Generator) -> Tensor:
         """Return the plane regularisers."""

@@ -10,7 +10,7 @@ Beyond the method, every splat has features of its own for the fine decoder (E-D
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -83,6 +83,8 @@ class Options:
 class MultiscaleMotion(Layer):
     """x + coarse + fine offset, q + fine offset, log s + fine offset (the method's section 3)."""
 
+    constants = ("fine_active",)
+
     def __init__(
         self, options: Options, facts: Facts, count: int, generator: torch.Generator
     ) -> None:
@@ -97,8 +99,7 @@ class MultiscaleMotion(Layer):
         self.fine = planes.new_levels(options.levels, times, options.channels, generator)
         features = options.channels * len(options.levels) + options.embedding
         features += options.coarse_channels if options.pyramid else 0
-        widths = [features, options.width, options.width, OUTPUTS]
-        self.decoder = network.new_network(widths, generator)
+        self.decoder = network.new_network([features, *[options.width] * 2, OUTPUTS], generator)
         self.embeddings = torch.zeros(count, options.embedding) if options.embedding else None
         super().__init__(self._named())
 
@@ -149,17 +150,12 @@ class MultiscaleMotion(Layer):
         embeddings: Tensor | None = None,
     ) -> Tensor:
         points = splats.means.detach() if self.options.detach else splats.means
-        times = [instant.time for instant in instants]
-        given = levels, points, times, self.facts.box, embeddings
+        given = levels, points, [now.time for now in instants], self.facts.box, embeddings
         return planes.lookup_at_times(*given, planes.evenly)
 
     def advance(self, progress: float) -> None:
         """Let the fine field join after ``coarse_until``."""
         self.fine_active = progress >= self.options.coarse_until
-
-    def constants(self) -> Hashable:
-        """Return whether the fine field has joined."""
-        return self.fine_active
 
     def penalty(self, moment: Moment, instant: Instant, generator: torch.Generator) -> Tensor:
         """Return the regularisers of the active grids, L_reg, L_smooth and that of embeddings.
@@ -192,9 +188,8 @@ class MultiscaleMotion(Layer):
         planes.check_levels([*self.coarse, *self.fine])
         coarse, fine = planes.features_of(self.coarse), planes.features_of(self.fine)
         network.check_network(self.coarse_decoder, coarse, 3)
-        inputs = fine + (coarse if self.options.pyramid else 0)
-        inputs += 0 if self.embeddings is None else self.embeddings.shape[1]
-        network.check_network(self.decoder, inputs, OUTPUTS)
+        own = 0 if self.embeddings is None else self.embeddings.shape[1]
+        network.check_network(self.decoder, fine + coarse * self.options.pyramid + own, OUTPUTS)
 
 
 def start(

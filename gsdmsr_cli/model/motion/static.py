@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable
 from dataclasses import dataclass
 
 import torch
@@ -20,13 +19,11 @@ class Options:
 class Static(Layer):
     """The identity at every time."""
 
+    constants = ()
+
     def at(self, moment: Moment, instant: Instant) -> Moment:
         """Return the moment itself."""
         return moment
-
-    def constants(self) -> Hashable:
-        """Return nothing: there is nothing to read."""
-        return ()
 
 
 def start(options: Options, facts: Facts, splats: Splats, generator: torch.Generator) -> Static:
