@@ -272,14 +272,15 @@ class Trainer:
 
     def _order(self, row: int, progress: float) -> Order:
         view, jitter = self.views[row], 0.0
-        weights = self._weights(row, self.renderer.tiles(view, progress, self.frozen))
+        weights = self._weights(row, progress)
         if self.model.needs_jitter:
             jitter = float(torch.randn((), generator=self.generator))
         others = self.renderer.other_times(view, self._times, self.generator)
         return Order(row, weights, jitter, others, self.renderer.seed(self.generator))
 
-    def _weights(self, row: int, tiles: int) -> Tensor | None:
-        """Return the weights of a view's tiles, None for the whole picture; 0 tiles have none."""
+    def _weights(self, row: int, progress: float) -> Tensor | None:
+        """Return the weights of a view's tiles, None for the whole picture."""
+        tiles = self.renderer.tiles(self.views[row], progress, self.frozen)
         if 0 < self.tiles.count < tiles:
             return self.tiles.choose(row, tiles, self.generator)
         return None

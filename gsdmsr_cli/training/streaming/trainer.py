@@ -192,11 +192,12 @@ class StreamTrainer(Trainer):
             if not self._changes or self._changes.wants(row, rows, self.generator):
                 return row
 
-    def _weights(self, row: int, tiles: int) -> Tensor | None:
+    def _weights(self, row: int, progress: float) -> Tensor | None:
         """Return the weights of tiles: those that have not changed are left out."""
-        if not (self._changes and tiles and self.frozen):
-            return super()._weights(row, tiles)
-        pictures = self.renderer.pictures_at(self.clock.progress)
+        allowed = self.renderer.tiles(self.views[row], progress, self.frozen) > 0
+        if not (self._changes and self.frozen and allowed):
+            return super()._weights(row, progress)
+        pictures = self.renderer.pictures_at(progress)
         return self._changes.weights(row, pictures, self.generator)
 
     def _penalty(self, order: Order, progress: float) -> Penalty | None:

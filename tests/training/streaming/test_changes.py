@@ -150,6 +150,16 @@ def test_tiles_are_those_of_the_pictures_that_are_drawn(
     assert later == {(True, 9), (False, 36)}
 
 
+def test_tiles_are_those_of_the_step_where_time_goes_on_meanwhile(rig: Path) -> None:
+    """With a budget the clock is beyond the progress that the step has begun with."""
+    trainer = stream_trainer(rig, "stream.changed=0.04", "training.low_resolution_until=0.4")
+    through(trainer, 1)
+    trainer.begin_next()
+    for progress, tiles in ((0.39, 9), (0.4, 36)):
+        weights = trainer._order(trainer.shot.rows[0], progress).tile_weights
+        assert weights is not None and len(weights) == tiles
+
+
 def test_a_stream_that_looks_at_changes_goes_on_as_if_it_had_not_ended(rig: Path) -> None:
     whole, first = (stream_trainer(rig, "stream.changed=0.04") for _ in range(2))
     through(whole, 3)
