@@ -11,6 +11,7 @@ import torch
 
 from gsdmsr_cli.backends.cuda.compiler import compiled
 from gsdmsr_cli.backends.cuda.nvrtc import load_nvrtc
+from gsdmsr_cli.backends.cuda.recording import Launched
 from gsdmsr_cli.ground.errors import GsdmsrError
 
 _LIBRARY = "nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1"
@@ -129,27 +130,18 @@ class Driver:
         """Let go of a graph; one that runs is let go of afterwards."""
         self._cuda.cuGraphExecDestroy(c_void_p(executable))
 
-    def give_node(
-        self,
-        executable: int,
-        node: int,
-        source: str,
-        kernel: str,
-        grid: tuple[int, int],
-        block: int,
-        arguments: ctypes.Array[c_void_p],
-        device: torch.device,
-    ) -> None:
+    def give_node(self, executable: int, node: int, launched: Launched) -> None:
         """Give a launch of a graph that can be executed other arguments from now on.
 
         Args:
             executable: handle of a CUgraphExec.
             node: of the graph that it was made from, see ``last_node``.
-            source, kernel, grid, block, arguments, device: see ``launch``.
+            launched: the launch, with the addresses that the arguments are read from now.
 
         Raises:
             GsdmsrError: the driver refuses.
         """
+        source, kernel, grid, block, arguments, device, _ = launched
         function = self._kernel(_index(device), source, kernel)
         params = _NodeParams(
             function, *grid, 1, block, 1, 1, 0, ctypes.addressof(arguments), None, None, None

@@ -99,7 +99,7 @@ class Recording(Generic[T]):
         for structure, fill in self._varied:
             fill(structure, inputs)
         for node in self._nodes:
-            self._driver.give_node(self._executable, node.handle, *node.launched[:6])
+            self._driver.give_node(self._executable, *node)
         self._driver.execute(self._executable, self._device)
         for what in self._followed:
             what.replayed()
