@@ -54,6 +54,13 @@ def test_every_preset_loads_and_survives_being_dumped(name: str, tmp_path: Path)
     assert load_preset(None, config, []) == preset
 
 
+@pytest.mark.parametrize("name", preset_files.preset_names())
+def test_a_preset_says_what_differs_in_under_25_lines(name: str) -> None:
+    if name != "default":  # which spells out everything
+        path = preset_files.preset_folder() / f"{name}.yaml"
+        assert len(path.read_text(encoding="utf-8").splitlines()) < 25
+
+
 def test_the_default_preset_spells_out_every_default() -> None:
     assert load_preset(None, None, []) == Preset()
     path = preset_files.preset_folder() / "default.yaml"

@@ -18,8 +18,6 @@ from gsdmsr_cli.model.layer import Facts, Instant, Layer
 from gsdmsr_cli.model.motion._arcs import added_to_none, slerp, turned
 from gsdmsr_cli.model.parameter import Parameter, Rate
 
-_PAST = "past_offsets", "past_turns"
-
 
 class Knot(NamedTuple):
     """Where R rows are at one moment.
@@ -168,10 +166,8 @@ class Streamed(Layer):
             which rows of which parameters, by name, (R,) bool.
         """
         found = {}
-        for name, new, past in (
-            ("offsets", self.offsets, self.past_offsets),
-            ("turns", self.turns, self.past_turns),
-        ):
+        for name in ("offsets", "turns"):
+            new, past = getattr(self, name), getattr(self, f"past_{name}")
             lost = ~new.isfinite().all(dim=1)
             if lost.any():
                 new[lost] = past[lost, 0]
@@ -182,7 +178,7 @@ class Streamed(Layer):
         """See ``Layer.restore``; there may be any number of moments."""
         for parameter in self.parameters():
             saved = tensors.get(parameter.name)
-            if parameter.name in _PAST and saved is not None and saved.dim() == 3:
+            if parameter.name.startswith("past_") and saved is not None and saved.dim() == 3:
                 rows = count if parameter.per_splat else len(saved)
                 width = parameter.tensor.shape[2]
                 parameter.set_values(parameter.tensor.new_zeros(rows, saved.shape[1], width))
