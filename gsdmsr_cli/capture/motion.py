@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -52,12 +53,8 @@ def write_found_masks(
     rays = rays_of(lens, pixels.reshape(-1, 2).astype(np.float32)).reshape(height, width, 2)
     masks, spacing = {}, max(1, round(len(greys) / keyframes))
     for i, name in enumerate(found.names):
-        others = [i + spacing * step for step in NEIGHBOURS if 0 <= i + spacing * step < len(greys)]
-        votes = [
-            _off_lines(greys[i], greys[j], rays, essential_matrix(found.poses[i], found.poses[j]))
-            for j in others
-        ] or [np.zeros((height, width))]
-        masks[name] = _cleaned(np.mean(votes, axis=0) * lens.fx > OFF)
+        off = off_camera(i, greys, rays, found.poses, spacing)
+        masks[name] = cleaned(off * lens.fx > OFF)
         on_progress(i + 1, len(found.names))
     for name in frames.names:
         small = masks.get(name, np.zeros((height, width), bool))
@@ -70,6 +67,31 @@ def _grey(path: Path, width: int, height: int) -> Grey:
     picture = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
     assert picture is not None
     return np.asarray(cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
+
+
+def off_camera(
+    i: int,
+    greys: Sequence[Grey],
+    rays: NDArray[np.float64],
+    poses: Sequence[NDArray[np.float64]] | NDArray[np.float64],
+    spacing: int,
+) -> NDArray[np.float64]:
+    """Return how far the flow of a frame's pixels is from what its camera's motion does, (H, W).
+
+    In units of rays; the mean over the neighbours, 0 where there are none.
+
+    Args:
+        i: the frame.
+        greys: (H, W) pictures of all frames, in the order of time.
+        rays: (H, W, 2) directions of the pixels.
+        poses: (4, 4) world-to-camera, of all frames.
+        spacing: of keyframes [frames].
+    """
+    others = [i + spacing * step for step in NEIGHBOURS if 0 <= i + spacing * step < len(greys)]
+    votes = [
+        _off_lines(greys[i], greys[j], rays, essential_matrix(poses[i], poses[j])) for j in others
+    ]
+    return np.asarray(np.mean(votes or [np.zeros(greys[i].shape)], axis=0))
 
 
 def _off_lines(
@@ -89,7 +111,7 @@ def _off_lines(
     return np.where(trusted(forward, back, INCONSISTENT), distances.reshape(height, width), 0.0)
 
 
-def _cleaned(moving: Mask) -> Mask:
+def cleaned(moving: Mask) -> Mask:
     """Return the mask without specks and without small holes."""
     height, width = moving.shape
     size = max(3, round(0.012 * max(height, width))) | 1

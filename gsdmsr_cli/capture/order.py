@@ -19,12 +19,17 @@ _ID = "publication"
 
 @dataclass(frozen=True)
 class Order:
-    """A command: its input, what that is taken for, the masks and the options."""
+    """A command: its input, what that is taken for, the masks, and the options.
+
+    Attributes:
+        standing: tells the model of what stands still from others, where masks are of one.
+    """
 
     given: Path
     kind: str | None
     masks: Masks | None
     options: Options
+    standing: str | None = None
 
     def announce(self, stages: Stages) -> dict[str, str]:
         """Note beside the stages that the scene is about to be moved to its place.
@@ -51,6 +56,8 @@ class Order:
     def _digest(self) -> str:
         masks = None if self.masks is None else [str(self.masks.folder), self.masks.inverted]
         about = {"kind": self.kind, "masks": masks, "options": asdict(self.options)}
+        if self.standing is not None:
+            about["standing"] = self.standing
         return digest({"given": list(_seen(self.given)), **about})
 
 

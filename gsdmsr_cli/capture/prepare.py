@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -26,6 +26,7 @@ from gsdmsr_cli.capture.quality import assess
 from gsdmsr_cli.capture.reconstruction import Reconstruction, read_reconstruction, with_placed
 from gsdmsr_cli.capture.report import write_page
 from gsdmsr_cli.capture.rig import Rig, read_rig, write_rig
+from gsdmsr_cli.capture.second_masks import Standing, with_masks, write_second_masks
 from gsdmsr_cli.capture.source import Source
 from gsdmsr_cli.capture.stages import Stages
 from gsdmsr_cli.capture.stages import digest as stage_digest
@@ -34,6 +35,7 @@ from gsdmsr_cli.formats import read_scene
 from gsdmsr_cli.ground.errors import DataError
 from gsdmsr_cli.ground.progress import OnProgress
 from gsdmsr_cli.scene import picture_hashes
+from gsdmsr_cli.scene.scene import Scene
 
 ShowProgress = Callable[[str], AbstractContextManager[OnProgress]]
 """Called with the name of a piece of work; yields the function that its progress is reported to."""
@@ -112,26 +114,51 @@ def prepare(
     return pipeline.run("scene", make, test_every=options.test_every)
 
 
-def convert(folder: Path, stages: Stages, show_progress: ShowProgress) -> Path:
+def convert(
+    folder: Path, stages: Stages, show_progress: ShowProgress, standing: Standing | None = None
+) -> Path:
     """Return the folder of a published data set's scene, one of the stages' folders.
 
     Frames of its videos that are not beside them are decoded into a stage of their own.
+
+    Args:
+        folder: of the data set.
+        stages: finished ones are not done again.
+        show_progress: see there.
+        standing: what stands still in it, by which what moves is masked; None leaves its masks.
 
     Raises:
         DataError: the data set cannot be used; the message says why.
     """
     with show_progress("reading the data set") as on_progress:
         scene = read_scene(folder, on_progress, stages.root / _decoded_name(folder))
+    key: dict[str, Any] = {
+        "layout": scene.layout, "fingerprint": scene.fingerprint, "versions": versions(),
+        "pictures": picture_hashes.digest(scene.pictures),
+    }  # fmt: skip
+    if standing is not None:
+        key |= {"standing": standing.key}
+        scene = _masked(scene, standing, stages, key, show_progress)
 
     def make(made: Path) -> None:
         with show_progress("writing the scene") as on_progress:
             write_converted(made, scene, on_progress)
 
-    key = {
-        "layout": scene.layout, "fingerprint": scene.fingerprint, "versions": versions(),
-        "pictures": picture_hashes.digest(scene.pictures),
-    }  # fmt: skip
     return stages.run("scene", key, make)
+
+
+def _masked(
+    scene: Scene,
+    standing: Standing,
+    stages: Stages,
+    key: Mapping[str, Any],
+    show_progress: ShowProgress,
+) -> Scene:
+    def find(folder: Path) -> None:
+        with show_progress("finding what moves") as on_progress:
+            write_second_masks(folder, scene, standing, on_progress)
+
+    return with_masks(scene, stages.run("masks", key, find))
 
 
 def _decoded_name(folder: Path) -> str:

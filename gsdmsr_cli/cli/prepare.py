@@ -62,6 +62,12 @@ def prepare(
     auto_mask: Annotated[
         bool, typer.Option("--auto-mask", help="Look for what moves, in a first pass.")
     ] = False,
+    masks_of: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="RUN", help="INPUT is a scene; mask what RUN, what stands still in it, lacks."
+        ),
+    ] = None,
     mapping: Annotated[
         Literal["global", "incremental"], typer.Option(help="COLMAP's mapper.")
     ] = "global",
@@ -84,6 +90,8 @@ def prepare(
 
     if masks is not None and auto_mask:
         raise UsageError("--masks and --auto-mask are both given; drop one")
+    if masks_of is not None and (masks is not None or auto_mask):
+        raise UsageError("--masks-of and --masks or --auto-mask are both given; drop one")
     if invert_masks and masks is None:
         raise UsageError("--invert-masks needs --masks")
     if rig and (format_ == "images" or masks is not None or auto_mask):
@@ -113,4 +121,4 @@ def prepare(
 
     given_masks = None if masks is None else Masks(masks, invert_masks)
     kind = "rig" if rig else format_
-    command.run(given, out, kind, given_masks, options, overwrite, keep_stages)
+    command.run(given, out, kind, given_masks, options, overwrite, keep_stages, masks_of)

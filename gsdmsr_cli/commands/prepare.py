@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Mapping
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
 from rich.table import Table
+from torch import Tensor
 
 from gsdmsr_cli.capture.options import Options
 from gsdmsr_cli.capture.order import Order
@@ -24,15 +28,21 @@ from gsdmsr_cli.capture.publish import (
     stages_of,
 )
 from gsdmsr_cli.capture.report import rows
+from gsdmsr_cli.capture.second_masks import Standing
 from gsdmsr_cli.capture.source import find_source
 from gsdmsr_cli.capture.stages import Stages
 from gsdmsr_cli.capture.write import NOTE, REPORT, TIMINGS
 from gsdmsr_cli.commands._stages_display import StagesDisplay
+from gsdmsr_cli.commands._trained import open_trained
 from gsdmsr_cli.formats import recognised
 from gsdmsr_cli.ground import say
 from gsdmsr_cli.ground.errors import DataError, UsageError
 from gsdmsr_cli.ground.files import read_json, write_json
 from gsdmsr_cli.ground.locks import one_of_readers, sole_writer
+from gsdmsr_cli.scene.scene import View
+
+STANDS_STILL = "static"
+"""Name of the motion that is none."""
 
 
 def run(
@@ -43,6 +53,7 @@ def run(
     options: Options,
     overwrite: bool,
     keep: bool,
+    masks_of: Path | None = None,
 ) -> None:
     """Write the scene folder ``out`` and print the report on its cameras.
 
@@ -54,6 +65,7 @@ def run(
         options: how the scene is made.
         overwrite: whether ``out`` may hold an earlier scene, which is replaced.
         keep: whether stages are kept for a run with other options.
+        masks_of: run of what stands still in ``given``, a scene, by which what moves is masked.
 
     Raises:
         UsageError: ``out`` is in use.
@@ -68,17 +80,23 @@ def run(
     source = None if kind is None and recognised(given) else find_source(given, kind)
     if source is None:
         _refuse_masks(given, masks, options)
-    order = Order(given, kind, masks, options)
+    elif masks_of is not None:
+        raise UsageError(
+            f"{given}: has no cameras yet, and --masks-of needs a scene that its run was trained "
+            "on; prepare it without --masks-of first"
+        )
     stages = Stages(stages_of(place))
     try:
         with ExitStack() as locks:
+            standing = None if masks_of is None else locks.enter_context(_standing(masks_of, given))
+            order = Order(given, kind, masks, options, None if standing is None else standing.key)
             _take_places(locks, out, place, stages)
             if not order.is_published(place, stages):
                 _refuse_used(out, place, overwrite)
                 if given.is_dir():
                     locks.enter_context(one_of_readers(given))
                 scene = (
-                    convert(given, stages, display.show)
+                    convert(given, stages, display.show, standing)
                     if source is None
                     else prepare(source, masks, options, stages, display.show)
                 )
@@ -95,6 +113,29 @@ def run(
             say.note(f"{text} and the same command goes on")
         raise
     _tell(out, display.seconds())
+
+
+@contextmanager
+def _standing(folder: Path, data: Path) -> Iterator[Standing]:
+    """Open a run of what stands still in ``data``, which nobody replaces until the end.
+
+    Raises:
+        DataError: the run cannot be used, or it was trained on something else, or to move.
+    """
+    with open_trained(folder, data) as trained:
+        name = trained.run.preset.motion["name"]
+        if name != STANDS_STILL:
+            raise DataError(
+                f"{folder}: its splats move ({name}), and --masks-of takes a run of what stands "
+                f"still: gsdmsr train --preset static-video --data {shlex.quote(str(data))}"
+            )
+        renderer = trained.renderer
+
+        def pixels(of: Callable[[View], Tensor], view: View) -> NDArray[np.float32]:
+            return of(view).clamp(0, 1).contiguous().numpy()
+
+        of_views = partial(pixels, renderer.draw), partial(pixels, renderer.true)
+        yield Standing(trained.checkpoint.sha256, *of_views)
 
 
 def _take_places(locks: ExitStack, out: Path, place: Path, stages: Stages) -> None:
@@ -128,7 +169,7 @@ def _refuse_masks(given: Path, masks: Masks | None, options: Options) -> None:
     if masks is not None or options.auto_mask:
         raise UsageError(
             f"{given}: is a data set with cameras, for which masks do nothing; drop them, or find "
-            "cameras anew with --format"
+            "cameras anew with --format, or take --masks-of a run of what stands still in it"
         )
 
 
