@@ -107,6 +107,11 @@ def tenths(samples: Sequence[Sample]) -> list[Sample]:
     return [_median(part) for part in _parts(samples, 10)]
 
 
+def largest(samples: Sequence[Sample]) -> Sample:
+    """Return the largest of each quantity, and at ``elapsed_s`` the length of all."""
+    return Sample(*np.max([astuple(sample) for sample in samples], axis=0).tolist())
+
+
 def growth(samples: Sequence[Sample]) -> Sample:
     """Return by how much each quantity has grown from the third quarter to the last, per hour.
 

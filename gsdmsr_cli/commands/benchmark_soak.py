@@ -7,7 +7,7 @@ from dataclasses import asdict
 
 from rich.table import Table
 
-from gsdmsr_cli.benchmark.soak import Sample, growth, tenths, watch
+from gsdmsr_cli.benchmark.soak import Sample, growth, largest, tenths, watch
 from gsdmsr_cli.ground import say
 
 SCHEMA = 1
@@ -29,6 +29,7 @@ def run(command: Sequence[str], every_s: float) -> None:
         "schema": SCHEMA,
         "command": list(command),
         "samples": [asdict(sample) for sample in samples],
+        "largest": asdict(largest(samples)),
         "growth_per_hour": asdict(slopes),
     }
     say.result(document, _table(samples, slopes))
@@ -39,6 +40,7 @@ def _table(samples: Sequence[Sample], slopes: Sample) -> Table:
     for sample in tenths(samples):
         table.add_row(f"{sample.elapsed_s / 60:.1f}", *_row(sample, ""))
     table.add_section()
+    table.add_row("largest", *_row(largest(samples), ""))
     table.add_row("growth per hour", *_row(slopes, "+"))
     return table
 

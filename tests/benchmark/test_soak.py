@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from gsdmsr_cli.benchmark.soak import Sample, growth, take_sample, tenths, watch
+from gsdmsr_cli.benchmark.soak import Sample, growth, largest, take_sample, tenths, watch
 from gsdmsr_cli.ground.errors import GsdmsrError
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="memory is counted on Linux only")
@@ -70,6 +70,7 @@ def test_growth_is_that_of_the_second_half_but_for_its_end() -> None:
     assert found.elapsed_s == pytest.approx(3600)
     assert found.memory_mib == pytest.approx(1800, rel=0.03)
     assert (found.shared_mib, found.files, found.processes) == (0, 0, 0)
+    assert largest(early + late) == Sample(199.0, 6099.0, 5.0, 110, 3)
     rows = tenths(early + late)
     assert len(rows) == 10
     assert rows[0] == Sample(9.5, 1475.0, 5.0, 19.5, 1)
@@ -85,7 +86,7 @@ def test_a_command_is_watched_to_its_end(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     document = json.loads(done.stdout)
     assert document["command"] == ["doctor"]
-    assert max(sample["memory_mib"] for sample in document["samples"]) > 20
+    assert document["largest"]["memory_mib"] > 20
     times = [sample["elapsed_s"] for sample in document["samples"]]
     assert times == sorted(times)
     assert "python" in done.stderr.lower()
