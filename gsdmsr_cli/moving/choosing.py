@@ -17,7 +17,7 @@ from gsdmsr_cli.ground.progress import OnProgress
 from gsdmsr_cli.moving.baked import Baked
 from gsdmsr_cli.moving.coding import CURVES, SHARES, coded, described, steps_named
 from gsdmsr_cli.moving.decoding import decoded
-from gsdmsr_cli.moving.parts import Part
+from gsdmsr_cli.moving.parts import QUICKLY, UNPACKED, Part
 
 FINEST, COARSEST = -8, 6
 """Powers of two by which the steps of the start are multiplied at most."""
@@ -84,7 +84,7 @@ def choose(
     start = search.coarsest(steps, 0, 1)
     steps = search.weighed({name: step * 2.0**start for name, step in steps.items()})
     power = search.coarsest(steps, 0, HALVINGS)
-    found = search.look({name: step * 2.0**power for name, step in steps.items()})
+    found = search.chosen({name: step * 2.0**power for name, step in steps.items()})
     on_progress(search.tries, search.tries)
     return found
 
@@ -104,7 +104,7 @@ class _Search:
         self.on_progress, self.tries = on_progress, 0
         self.expected = 12 + len(steps_named(baked))
 
-    def look(self, steps: Mapping[str, float]) -> Chosen:
+    def chosen(self, steps: Mapping[str, float]) -> Chosen:
         """Return the parts with these steps, and what is lost."""
         parts = coded(self.baked, steps, self.bound)
         return Chosen(parts, self._lost(parts).measured)
@@ -139,13 +139,14 @@ class _Search:
 
     def weighed(self, steps: Mapping[str, float]) -> dict[str, float]:
         """Return steps that add up to the same loss with fewer bytes."""
-        sizes = _sizes(coded(self.baked, steps, self.bound))
-        smaller = _sizes(coded(self.baked, _times(steps, 2.0), self.bound))
+        both = steps, _times(steps, 2.0)
+        sizes, smaller = (_sizes(coded(self.baked, s, self.bound, QUICKLY)) for s in both)
         fine = _times(steps, ALONE)
         losses, prices = {}, {}
         for name in steps:
-            parts = coded(self.baked, fine | {name: steps[name]}, self.bound)
-            losses[name] = max(self._lost(parts).expected, LEAST_LOSS)
+            losses[name] = max(
+                self._lost(self._said(fine | {name: steps[name]})).expected, LEAST_LOSS
+            )
             prices[name] = max(sizes.get(name, 0) - smaller.get(name, 0), 1)
         whole = sum(prices.values())
         return {
@@ -154,7 +155,11 @@ class _Search:
         }
 
     def _fits(self, steps: Mapping[str, float], power: float) -> bool:
-        return self.look(_times(steps, 2.0**power)).loss <= self.most
+        return self._lost(self._said(_times(steps, 2.0**power))).measured <= self.most
+
+    def _said(self, steps: Mapping[str, float]) -> list[Part]:
+        """Return parts that are only read: most of the time of all tries went into packing them."""
+        return coded(self.baked, steps, self.bound, UNPACKED)
 
     def _lost(self, parts: list[Part]) -> Lost:
         self.tries += 1

@@ -13,7 +13,7 @@ from torch import Tensor
 from gsdmsr_cli.gaussians.splats import Splats
 from gsdmsr_cli.moving.baked import COLOURS, OF_BODIES, Baked, Bodies
 from gsdmsr_cli.moving.curves import Track
-from gsdmsr_cli.moving.parts import Floats, Part, plain_part, short, signed_part
+from gsdmsr_cli.moving.parts import LEVEL, Floats, Part, plain_part, short, signed_part
 from gsdmsr_cli.moving.places import code_places
 
 Steps = Mapping[str, float]
@@ -45,32 +45,34 @@ def steps_named(baked: Baked) -> dict[str, float]:
     return names | {name: of_tracks[name.partition("/")[2]] for name in baked.tracks}
 
 
-def coded(baked: Baked, steps: Steps, bound: float) -> list[Part]:
+def coded(baked: Baked, steps: Steps, bound: float, level: int = LEVEL) -> list[Part]:
     """Return the parts of a file, the splats in an order that takes few bytes.
 
     Args:
         baked: what is coded.
         steps: of all that ``steps_named`` names.
         bound: half edge of the cube that holds the scene [world units].
+        level: of zlib; what the parts say does not depend on it.
     """
     means = _array(baked.splats.means)
-    places, rows = code_places(means, baked.moving, steps["means"], bound)
+    places, rows = code_places(means, baked.moving, steps["means"], bound, level)
     order = torch.from_numpy(rows)
     splats, first = baked.splats.take(order), order[: baked.moving]
-    parts = [places, *_splat_parts(splats, steps)]
+    parts = [places, *_splat_parts(splats, steps, level)]
     if baked.lives is not None:
         times, durations = _array(baked.lives[first]).clip(-64, 64), FIXED["log_durations"]
-        parts.append(plain_part("lives", times, np.array([FIXED["times"]] * 2 + [durations] * 2)))
+        fixed = np.array([FIXED["times"]] * 2 + [durations] * 2)
+        parts.append(plain_part("lives", times, fixed, level))
     if baked.bodies is not None:
-        parts += _bodies_parts(baked.bodies, first, bound)
+        parts += _bodies_parts(baked.bodies, first, bound, level)
     for name, track in baked.tracks.items():
         held = track if name in OF_BODIES else replace(track, shares=track.shares[first])
         scale = bound if name.endswith("/offset") else 1.0
-        parts += _track_parts(name, held, steps[name] * scale)
+        parts += _track_parts(name, held, steps[name] * scale, level)
     return parts
 
 
-def _splat_parts(splats: Splats, steps: Steps) -> list[Part]:
+def _splat_parts(splats: Splats, steps: Steps, level: int) -> list[Part]:
     colours = _array(splats.sh) @ TO_YCOCG.T
     values = {
         "quats": _array(splats.quats)[:, 1:],
@@ -79,19 +81,20 @@ def _splat_parts(splats: Splats, steps: Steps) -> list[Part]:
         "sh_0": colours[:, 0],
         "sh_rest": colours[:, 1:].reshape(len(colours), -1),
     }
-    return [plain_part(name, values[name], steps[name]) for name in values if name in steps]
+    return [plain_part(name, values[name], steps[name], level) for name in values if name in steps]
 
 
-def _bodies_parts(bodies: Bodies, first: Tensor, bound: float) -> list[Part]:
-    parts = [plain_part("points", _array(bodies.points), FIXED["points"] * bound)]
+def _bodies_parts(bodies: Bodies, first: Tensor, bound: float, level: int) -> list[Part]:
+    parts = [plain_part("points", _array(bodies.points), FIXED["points"] * bound, level)]
     if bodies.log_radii is not None and bodies.body is None:
-        parts.append(plain_part("log_radii", _array(bodies.log_radii)[:, None], FIXED["log_radii"]))
+        radii = _array(bodies.log_radii)[:, None]
+        parts.append(plain_part("log_radii", radii, FIXED["log_radii"], level))
     if bodies.body is not None:
-        parts.append(plain_part("body", _array(bodies.body[first])[:, None], 1.0))
+        parts.append(plain_part("body", _array(bodies.body[first])[:, None], 1.0, level))
     return parts
 
 
-def _track_parts(name: str, track: Track, step: float) -> list[Part]:
+def _track_parts(name: str, track: Track, step: float, level: int) -> list[Part]:
     """Code a track's shares, and the curves of which any channel has a share left."""
     step = float(short(np.array([step]))[0])
     shares = _array(track.shares)
@@ -108,8 +111,8 @@ def _track_parts(name: str, track: Track, step: float) -> list[Part]:
     shared = np.sqrt(np.square(q, dtype=np.float64).mean(axis=(0, 1)))
     fine = FINER / np.maximum(shared, FINER)
     return [
-        plain_part(CURVES + name, curves, fine),
-        signed_part(SHARES + name, q.reshape(len(q), -1), step),
+        plain_part(CURVES + name, curves, fine, level),
+        signed_part(SHARES + name, q.reshape(len(q), -1), step, level),
     ]
 
 

@@ -22,6 +22,10 @@ MOST_INFLATED, MOST_HELD = 1100, 1 << 30
 LEVEL = 9
 """Of zlib: the file is written once and fetched often."""
 
+UNPACKED, QUICKLY = 0, 4
+"""Levels for parts of which no more is asked than what they say, which have no stream, or about
+how long it is."""
+
 
 @dataclass(frozen=True)
 class Part:
@@ -36,6 +40,7 @@ class Part:
         least, step: one number a column, or one for all.
         extra: what else the header says of it.
         stream: the integers, column by column, each as planes from the lowest byte on; deflated.
+        unpacked: the integers themselves, (rows, columns), in place of the stream.
     """
 
     name: str
@@ -48,6 +53,7 @@ class Part:
     step: tuple[float, ...]
     extra: Mapping[str, Any]
     stream: bytes
+    unpacked: Integers | None = None
 
     def described(self) -> dict[str, Any]:
         """Return what the header of the file says of the part."""
@@ -94,44 +100,53 @@ def quantised(values: Floats, least: Floats, step: Floats) -> Integers:
     return np.rint((values - least) / step).astype(np.int64).clip(min=0)
 
 
-def plain_part(name: str, values: Floats, step: float | Floats) -> Part:
+def plain_part(name: str, values: Floats, step: float | Floats, level: int = LEVEL) -> Part:
     """Code values (rows, columns) from the least of each column on, in the shorter of two ways.
 
     Args:
         name: of the part.
         values: finite.
         step: above 0, one for all columns or one of each.
+        level: of zlib.
     """
     steps = short(np.atleast_1d(np.asarray(step, np.float64)))
     least = short(values.min(axis=0) if len(values) else np.zeros(values.shape[1]))
     q = quantised(values, least, steps)
-    ways = [_coded(name, q, False, False, least, steps), _coded(name, q, False, True, least, steps)]
-    return min(ways, key=lambda part: len(part.stream))
+    way = _coded(name, q, False, False, least, steps, level)
+    if level == UNPACKED:
+        return way
+    other = _coded(name, q, False, True, least, steps, level)
+    return min(way, other, key=lambda part: len(part.stream))
 
 
-def signed_part(name: str, q: Integers, step: float) -> Part:
+def signed_part(name: str, q: Integers, step: float, level: int = LEVEL) -> Part:
     """Code integers (rows, columns) about 0, which stand for as many times ``step``.
 
     ``step`` is one of ``short`` numbers.
     """
-    return _coded(name, q, True, False, np.zeros(1), np.full(1, step))
+    return _coded(name, q, True, False, np.zeros(1), np.full(1, step), level)
 
 
 def sums_part(
-    name: str, increments: Integers, least: Floats, step: Floats, extra: Mapping[str, Any]
+    name: str,
+    increments: Integers,
+    least: Floats,
+    step: Floats,
+    extra: Mapping[str, Any],
+    level: int = LEVEL,
 ) -> Part:
     """Code increments (rows, 1), 0 or more, as they are; the reader knows what they add up to."""
-    return _packed(name, increments, False, False, least, step, extra)
+    return _packed(name, increments, False, False, least, step, extra, level)
 
 
 def _coded(
-    name: str, q: Integers, signed: bool, difference: bool, least: Floats, step: Floats
+    name: str, q: Integers, signed: bool, difference: bool, least: Floats, step: Floats, level: int
 ) -> Part:
     if difference:
         q = np.diff(q, axis=0, prepend=0)
     if signed or difference:
         q = np.where(q < 0, -2 * q - 1, 2 * q)
-    return _packed(name, q, signed, difference, least, step, {})
+    return _packed(name, q, signed, difference, least, step, {}, level)
 
 
 def _packed(
@@ -142,14 +157,17 @@ def _packed(
     least: Floats,
     step: Floats,
     extra: Mapping[str, Any],
+    level: int,
 ) -> Part:
     rows, columns = u.shape
     width = max(1, -(-int(u.max(initial=0)).bit_length() // 8))
     if width > MOST_BYTES:
         raise ValueError(f"'{name}' needs integers of {width} bytes")
-    planes = np.ascontiguousarray(u.T).astype("<u8").view(np.uint8).reshape(columns, rows, 8)
-    stream = zlib.compress(planes[:, :, :width].transpose(0, 2, 1).tobytes(), LEVEL)
     limits = tuple(map(float, least)), tuple(map(float, step))
+    if level == UNPACKED:
+        return Part(name, rows, columns, width, signed, difference, *limits, extra, b"", u)
+    planes = np.ascontiguousarray(u.T).astype("<u8").view(np.uint8).reshape(columns, rows, 8)
+    stream = zlib.compress(planes[:, :, :width].transpose(0, 2, 1).tobytes(), level)
     return Part(name, rows, columns, width, signed, difference, *limits, extra, stream)
 
 
@@ -159,6 +177,13 @@ def integers_of(part: Part) -> Integers:
     Raises:
         ValueError: the stream is damaged, or not of this length.
     """
+    u = _inflated(part) if part.unpacked is None else part.unpacked
+    if part.signed or part.difference:
+        u = (u >> 1) ^ -(u & 1)
+    return np.cumsum(u, axis=0) if part.difference else u
+
+
+def _inflated(part: Part) -> Integers:
     wanted = part.rows * part.columns * part.width
     if wanted > MOST_INFLATED * (len(part.stream) + 1) or wanted > MOST_HELD:
         raise ValueError(f"part '{part.name}' cannot hold {wanted} bytes")
@@ -173,9 +198,7 @@ def integers_of(part: Part) -> Integers:
     u = np.zeros((part.rows, part.columns), np.int64)
     for place in range(part.width):
         u |= planes[:, place].T.astype(np.int64) << (8 * place)
-    if part.signed or part.difference:
-        u = (u >> 1) ^ -(u & 1)
-    return np.cumsum(u, axis=0) if part.difference else u
+    return u
 
 
 def values_of(part: Part) -> Floats:

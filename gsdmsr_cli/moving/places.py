@@ -5,7 +5,16 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from gsdmsr_cli.moving.parts import Floats, Integers, Part, integers_of, quantised, short, sums_part
+from gsdmsr_cli.moving.parts import (
+    LEVEL,
+    Floats,
+    Integers,
+    Part,
+    integers_of,
+    quantised,
+    short,
+    sums_part,
+)
 
 AXES = 3
 MOST_BITS = 16
@@ -27,7 +36,7 @@ def unwarped(values: Floats, warp: float) -> Floats:
 
 
 def code_places(
-    means: Floats, moving: int, step: float, warp: float
+    means: Floats, moving: int, step: float, warp: float, level: int = LEVEL
 ) -> tuple[Part, NDArray[np.intp]]:
     """Code centres, each of two blocks in the order of a Morton curve.
 
@@ -36,6 +45,7 @@ def code_places(
         moving: length of the first block.
         step: between two neighbouring places, in units of ``warp`` near the origin.
         warp: from about where on steps grow with the distance [world units].
+        level: of zlib.
 
     Returns:
         The part, and which row of ``means`` each of its rows is.
@@ -50,7 +60,7 @@ def code_places(
     order = [block[np.argsort(codes[block], kind="stable")] for block in blocks]
     increments = np.concatenate([np.diff(codes[rows], prepend=0) for rows in order])
     extra = {"warp": warp}
-    part = sums_part(NAME, increments[:, None], least, np.full(AXES, step), extra)
+    part = sums_part(NAME, increments[:, None], least, np.full(AXES, step), extra, level)
     return part, np.concatenate(order)
 
 

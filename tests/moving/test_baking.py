@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from kernel_checks import generator
@@ -25,6 +26,7 @@ from gsdmsr_cli.moving.baking import bake
 from gsdmsr_cli.moving.coding import coded, described, steps_named
 from gsdmsr_cli.moving.container import from_bytes, to_bytes
 from gsdmsr_cli.moving.decoding import decoded
+from gsdmsr_cli.moving.parts import LEVEL, QUICKLY, UNPACKED, integers_of
 from gsdmsr_cli.moving.playing import model_of
 from gsdmsr_cli.moving.shapes import rotations_and_scales, upright
 
@@ -176,6 +178,20 @@ def test_what_is_coded_comes_back_as_fine_as_asked(name: str) -> None:
         assert torch.allclose(getattr(first, attribute), getattr(second, attribute), atol=2e-2)
     opacities = first.logit_opacities.sigmoid(), second.logit_opacities.sigmoid()
     assert torch.allclose(*opacities, atol=2e-2)
+
+
+@pytest.mark.parametrize("name", ["control_points", "multiscale", "covariance_4d", "rigid_groups"])
+def test_parts_say_the_same_however_they_are_packed(name: str) -> None:
+    baked = bake(model_with(name, 30), FACTS.frames)
+    packed, *others = (
+        coded(baked, steps_named(baked), FACTS.bound, level) for level in (LEVEL, QUICKLY, UNPACKED)
+    )
+    for parts in others:
+        for one, other in zip(packed, parts, strict=True):
+            assert (one.name, one.least, one.step) == (other.name, other.least, other.step)
+            assert np.array_equal(integers_of(one), integers_of(other))
+    with pytest.raises(ValueError, match="no stream"):
+        to_bytes(described(baked), others[1])
 
 
 def test_coarse_steps_take_fewer_bytes() -> None:
