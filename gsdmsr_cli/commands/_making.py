@@ -84,9 +84,12 @@ class Making:
         else:
             self._write()
 
-    def is_to_do(self, stage: str, checkpoint: str) -> bool:
-        """Return whether a stage has not been finished for a checkpoint, named by its hash."""
-        return self._done.get(stage) != checkpoint
+    def is_to_do(self, stage: str, checkpoint: str, left: Path) -> bool:
+        """Return whether a stage has not been finished for a checkpoint, named by its hash.
+
+        Nor is it if what it has ``left`` is not there any more.
+        """
+        return self._done.get(stage) != checkpoint or not left.exists()
 
     def done(self, stage: str, checkpoint: str) -> None:
         """Note that it has."""

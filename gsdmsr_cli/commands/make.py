@@ -66,10 +66,10 @@ def _make(request: Request, making: Making) -> None:
             prepare.run(request.given, data, None, None, options, overwrite=False, keep=False)
     _train(request, data, folder)
     checkpoint = open_run(folder).load().sha256
-    if making.is_to_do("eval", checkpoint):
+    if making.is_to_do("eval", checkpoint, folder / EVALUATION / METRICS):
         evaluate.run(folder, None, None, Output(report=True, play=True))
         making.done("eval", checkpoint)
-    if making.is_to_do("render", checkpoint):
+    if making.is_to_do("render", checkpoint, folder / FILMS):
         for film in _films_of_a_video(data) if prepared else [FilmRequest()]:
             render.run(folder, film, None)
         making.done("render", checkpoint)

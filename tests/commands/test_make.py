@@ -53,6 +53,11 @@ def test_a_scene_ends_as_pages_and_films_and_nothing_is_done_twice(
     before = {path: path.stat().st_mtime_ns for path in out.rglob("*") if path.is_file()}
     assert made(tiny_scene, out) == told
     assert {p: p.stat().st_mtime_ns for p in out.rglob("*") if p.is_file()} == before
+    shutil.rmtree(out / "run" / "eval")
+    shutil.rmtree(out / "run" / "render")
+    assert made(tiny_scene, out)["places"] == told["places"]
+    for name in (*MADE, "run/render/test.webm", "run/render/orbit.webm"):
+        assert (out / name).is_file(), name
     longer = made(tiny_scene, out, "--budget", "5s")
     training = json.loads((out / "run" / "training.json").read_text())
     assert training["train_s"] > 4.5 and longer["aggregate"] != told["aggregate"]
