@@ -91,9 +91,9 @@ def with_masks(scene: Scene, folder: Path) -> Scene:
 
     Views beside the camera's path keep those that they have.
     """
-    masked = {id(view): folder / _name(view) for view in on_path(scene)}
+    masked = set(map(id, on_path(scene)))
     views = (
-        replace(view, signals={**view.signals, MOVING: masked[id(view)]})
+        replace(view, signals={**view.signals, MOVING: folder / _name(view)})
         if id(view) in masked
         else view
         for view in scene.views

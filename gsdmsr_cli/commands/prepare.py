@@ -3,16 +3,12 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager
-from functools import partial
+from collections.abc import Mapping
+from contextlib import AbstractContextManager, ExitStack
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
 from rich.table import Table
-from torch import Tensor
 
 from gsdmsr_cli.capture.options import Options
 from gsdmsr_cli.capture.order import Order
@@ -33,16 +29,11 @@ from gsdmsr_cli.capture.source import find_source
 from gsdmsr_cli.capture.stages import Stages
 from gsdmsr_cli.capture.write import NOTE, REPORT, TIMINGS
 from gsdmsr_cli.commands._stages_display import StagesDisplay
-from gsdmsr_cli.commands._trained import open_trained
 from gsdmsr_cli.formats import recognised
 from gsdmsr_cli.ground import say
 from gsdmsr_cli.ground.errors import DataError, UsageError
 from gsdmsr_cli.ground.files import read_json, write_json
 from gsdmsr_cli.ground.locks import one_of_readers, sole_writer
-from gsdmsr_cli.scene.scene import View
-
-STANDS_STILL = "static"
-"""Name of the motion that is none."""
 
 
 def run(
@@ -115,27 +106,11 @@ def run(
     _tell(out, display.seconds())
 
 
-@contextmanager
-def _standing(folder: Path, data: Path) -> Iterator[Standing]:
-    """Open a run of what stands still in ``data``, which nobody replaces until the end.
+def _standing(folder: Path, data: Path) -> AbstractContextManager[Standing]:
+    # what draws is loaded only where something is drawn
+    from gsdmsr_cli.commands._standing import open_standing
 
-    Raises:
-        DataError: the run cannot be used, or it was trained on something else, or to move.
-    """
-    with open_trained(folder, data) as trained:
-        name = trained.run.preset.motion["name"]
-        if name != STANDS_STILL:
-            raise DataError(
-                f"{folder}: its splats move ({name}), and --masks-of takes a run of what stands "
-                f"still: gsdmsr train --preset static-video --data {shlex.quote(str(data))}"
-            )
-        renderer = trained.renderer
-
-        def pixels(of: Callable[[View], Tensor], view: View) -> NDArray[np.float32]:
-            return of(view).clamp(0, 1).contiguous().numpy()
-
-        of_views = partial(pixels, renderer.draw), partial(pixels, renderer.true)
-        yield Standing(trained.checkpoint.sha256, *of_views)
+    return open_standing(folder, data)
 
 
 def _take_places(locks: ExitStack, out: Path, place: Path, stages: Stages) -> None:

@@ -141,6 +141,12 @@ def test_a_scene_gets_the_masks_of_a_run_of_what_stands_still(tmp_path: Path) ->
             assert new.signals[MOVING].read_bytes() == old.signals[MOVING].read_bytes()
 
 
+def test_prepare_loads_nothing_that_draws_where_nothing_is_drawn() -> None:
+    code = "import sys, gsdmsr_cli.commands.prepare; print('torch' in sys.modules)"
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert ended.stdout == "False\n", ended.stderr
+
+
 @pytest.mark.parametrize(
     ("more", "message"),
     [

@@ -8,7 +8,6 @@ from __future__ import annotations
 import argparse
 import tempfile
 from collections.abc import Iterator, Mapping
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +17,8 @@ from numpy.typing import NDArray
 
 from gsdmsr_cli.capture import second_masks
 from gsdmsr_cli.capture.masks import read_mask
-from gsdmsr_cli.capture.second_masks import Standing, with_masks, write_second_masks
+from gsdmsr_cli.capture.second_masks import with_masks, write_second_masks
+from gsdmsr_cli.commands._standing import standing_of
 from gsdmsr_cli.evaluation.protocol import ViewRenderer
 from gsdmsr_cli.scene.scene import MOVING
 from gsdmsr_cli.training.trainer import Trainer
@@ -56,33 +56,24 @@ def main() -> None:
 
 def judged(trainer: Trainer, changes: Mapping[str, float]) -> Iterator[tuple[float, float, float]]:
     """Yield overlap, precision and recall of the masks of all pictures on the path."""
-    on_path = tuple(view for view in trainer.scene.views if view.split != "test")
-    scene = replace(trainer.scene, views=on_path)
+    scene, training = trainer.scene, trainer.renderer
+    given = training.engine, training.pictures, training.background
+    standing = standing_of(ViewRenderer(trainer.result(), *given), key="")
     kept = {name: getattr(second_masks, name) for name in changes}
     with tempfile.TemporaryDirectory() as folder:
         try:
             for name, value in changes.items():
                 setattr(second_masks, name, value)
-            write_second_masks(Path(folder), scene, standing(trainer), lambda done, total: None)
+            write_second_masks(Path(folder), scene, standing, lambda done, total: None)
         finally:
             for name, value in kept.items():
                 setattr(second_masks, name, value)
-        for view, masked in zip(on_path, with_masks(scene, Path(folder)).views, strict=True):
+        for view, masked in zip(scene.views, with_masks(scene, Path(folder)).views, strict=True):
+            if masked is view:  # beside the path
+                continue
             true, found = (read_mask(own.signals[MOVING]) for own in (view, masked))
             both = (true & found).sum()
             yield both / (true | found).sum(), both / max(1, found.sum()), both / true.sum()
-
-
-def standing(trainer: Trainer) -> Standing:
-    """Return the trained room as a model of what stands still."""
-    training = trainer.renderer
-    given = training.engine, training.pictures, training.background
-    renderer = ViewRenderer(trainer.result(), *given)
-    return Standing(
-        key="",
-        draw=lambda view: renderer.draw(view).clamp(0, 1).contiguous().numpy(),
-        true=lambda view: renderer.true(view).contiguous().numpy(),
-    )
 
 
 if __name__ == "__main__":
