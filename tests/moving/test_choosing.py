@@ -79,6 +79,18 @@ def test_what_does_not_matter_is_coarser_than_what_does(baked: Baked) -> None:
     assert change["log_scales"] > max(2 * change["sh_0"], 1.1 * change["means"])
 
 
+def test_what_coding_gains_by_chance_counts_as_what_it_loses(baked: Baked) -> None:
+    """A file of a model that is bad as yet is to show that model."""
+    lost = Distance(baked)
+
+    def judge(other: Baked) -> Said:
+        loss = lost(other)
+        return Said(-loss.measured, loss.expected)
+
+    chosen = choose(baked, FACTS.bound, 1e-3, judge)
+    assert -1e-3 <= chosen.loss < -0.5e-3
+
+
 def test_a_loss_that_no_coding_keeps_to_is_an_error(baked: Baked) -> None:
     with pytest.raises(DataError, match=r"even the finest coding loses more than 0\.1 dB"):
         choose(baked, FACTS.bound, 0.1, lambda other: Said(0.2, 0.2))
