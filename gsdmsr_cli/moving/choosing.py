@@ -17,7 +17,7 @@ from gsdmsr_cli.ground.progress import OnProgress
 from gsdmsr_cli.moving.baked import Baked
 from gsdmsr_cli.moving.coding import CURVES, SHARES, coded, described, steps_named
 from gsdmsr_cli.moving.decoding import decoded
-from gsdmsr_cli.moving.parts import QUICKLY, UNPACKED, Part
+from gsdmsr_cli.moving.parts import QUICKLY, Part, Table, packed
 
 FINEST, COARSEST = -8, 6
 """Powers of two by which the steps of the start are multiplied at most."""
@@ -106,8 +106,8 @@ class _Search:
 
     def chosen(self, steps: Mapping[str, float]) -> Chosen:
         """Return the parts with these steps, and what is lost."""
-        parts = coded(self.baked, steps, self.bound)
-        return Chosen(parts, self._lost(parts).measured)
+        tables = self._coded(steps)
+        return Chosen([packed(table) for table in tables], self._lost(tables).measured)
 
     def coarsest(self, steps: Mapping[str, float], start: int, finer: int) -> float:
         """Return the largest power of two whose multiple of the steps loses no more than allowed.
@@ -140,12 +140,12 @@ class _Search:
     def weighed(self, steps: Mapping[str, float]) -> dict[str, float]:
         """Return steps that add up to the same loss with fewer bytes."""
         both = steps, _times(steps, 2.0)
-        sizes, smaller = (_sizes(coded(self.baked, s, self.bound, QUICKLY)) for s in both)
+        sizes, smaller = (_sizes([packed(t, QUICKLY) for t in self._coded(s)]) for s in both)
         fine = _times(steps, ALONE)
         losses, prices = {}, {}
         for name in steps:
             losses[name] = max(
-                self._lost(self._said(fine | {name: steps[name]})).expected, LEAST_LOSS
+                self._lost(self._coded(fine | {name: steps[name]})).expected, LEAST_LOSS
             )
             prices[name] = max(sizes.get(name, 0) - smaller.get(name, 0), 1)
         whole = sum(prices.values())
@@ -156,16 +156,16 @@ class _Search:
 
     def _fits(self, steps: Mapping[str, float], power: float) -> bool:
         # What a coarse file gains by chance, a bad model's may, is not the model's either.
-        return abs(self._lost(self._said(_times(steps, 2.0**power))).measured) <= self.most
+        return abs(self._lost(self._coded(_times(steps, 2.0**power))).measured) <= self.most
 
-    def _said(self, steps: Mapping[str, float]) -> list[Part]:
-        """Return parts that are only read: most of the time of all tries went into packing them."""
-        return coded(self.baked, steps, self.bound, UNPACKED)
+    def _coded(self, steps: Mapping[str, float]) -> list[Table]:
+        """Return tables, not packed: most of the time of all tries would go into that."""
+        return coded(self.baked, steps, self.bound)
 
-    def _lost(self, parts: list[Part]) -> Lost:
+    def _lost(self, tables: list[Table]) -> Lost:
         self.tries += 1
         self.on_progress(min(self.tries, self.expected - 1), self.expected)
-        return self.judge(decoded(described(self.baked), {part.name: part for part in parts}))
+        return self.judge(decoded(described(self.baked), {table.name: table for table in tables}))
 
 
 def _times(steps: Mapping[str, float], factor: float) -> dict[str, float]:

@@ -1,4 +1,4 @@
-"""What has been baked, as parts of a file, as coarse as steps say; ``decoding`` reads them."""
+"""What has been baked, as tables of integers, as coarse as steps say; ``decoding`` reads them."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from torch import Tensor
 from gsdmsr_cli.gaussians.splats import Splats
 from gsdmsr_cli.moving.baked import COLOURS, OF_BODIES, Baked, Bodies
 from gsdmsr_cli.moving.curves import Track
-from gsdmsr_cli.moving.parts import LEVEL, Floats, Part, plain_part, short, signed_part
+from gsdmsr_cli.moving.parts import Floats, Table, plain_table, short, signed_table
 from gsdmsr_cli.moving.places import code_places
 
 Steps = Mapping[str, float]
@@ -45,34 +45,33 @@ def steps_named(baked: Baked) -> dict[str, float]:
     return names | {name: of_tracks[name.partition("/")[2]] for name in baked.tracks}
 
 
-def coded(baked: Baked, steps: Steps, bound: float, level: int = LEVEL) -> list[Part]:
-    """Return the parts of a file, the splats in an order that takes few bytes.
+def coded(baked: Baked, steps: Steps, bound: float) -> list[Table]:
+    """Return what the parts of a file say, the splats in an order that takes few bytes.
 
     Args:
         baked: what is coded.
         steps: of all that ``steps_named`` names.
         bound: half edge of the cube that holds the scene [world units].
-        level: of zlib; what the parts say does not depend on it.
     """
     means = _array(baked.splats.means)
-    places, rows = code_places(means, baked.moving, steps["means"], bound, level)
+    places, rows = code_places(means, baked.moving, steps["means"], bound)
     order = torch.from_numpy(rows)
     splats, first = baked.splats.take(order), order[: baked.moving]
-    parts = [places, *_splat_parts(splats, steps, level)]
+    tables = [places, *_splat_tables(splats, steps)]
     if baked.lives is not None:
         times, durations = _array(baked.lives[first]).clip(-64, 64), FIXED["log_durations"]
         fixed = np.array([FIXED["times"]] * 2 + [durations] * 2)
-        parts.append(plain_part("lives", times, fixed, level))
+        tables.append(plain_table("lives", times, fixed))
     if baked.bodies is not None:
-        parts += _bodies_parts(baked.bodies, first, bound, level)
+        tables += _bodies_tables(baked.bodies, first, bound)
     for name, track in baked.tracks.items():
         held = track if name in OF_BODIES else replace(track, shares=track.shares[first])
         scale = bound if name.endswith("/offset") else 1.0
-        parts += _track_parts(name, held, steps[name] * scale, level)
-    return parts
+        tables += _track_tables(name, held, steps[name] * scale)
+    return tables
 
 
-def _splat_parts(splats: Splats, steps: Steps, level: int) -> list[Part]:
+def _splat_tables(splats: Splats, steps: Steps) -> list[Table]:
     colours = _array(splats.sh) @ TO_YCOCG.T
     values = {
         "quats": _array(splats.quats)[:, 1:],
@@ -81,20 +80,20 @@ def _splat_parts(splats: Splats, steps: Steps, level: int) -> list[Part]:
         "sh_0": colours[:, 0],
         "sh_rest": colours[:, 1:].reshape(len(colours), -1),
     }
-    return [plain_part(name, values[name], steps[name], level) for name in values if name in steps]
+    return [plain_table(name, values[name], steps[name]) for name in values if name in steps]
 
 
-def _bodies_parts(bodies: Bodies, first: Tensor, bound: float, level: int) -> list[Part]:
-    parts = [plain_part("points", _array(bodies.points), FIXED["points"] * bound, level)]
+def _bodies_tables(bodies: Bodies, first: Tensor, bound: float) -> list[Table]:
+    tables = [plain_table("points", _array(bodies.points), FIXED["points"] * bound)]
     if bodies.log_radii is not None and bodies.body is None:
         radii = _array(bodies.log_radii)[:, None]
-        parts.append(plain_part("log_radii", radii, FIXED["log_radii"], level))
+        tables.append(plain_table("log_radii", radii, FIXED["log_radii"]))
     if bodies.body is not None:
-        parts.append(plain_part("body", _array(bodies.body[first])[:, None], 1.0, level))
-    return parts
+        tables.append(plain_table("body", _array(bodies.body[first])[:, None], 1.0))
+    return tables
 
 
-def _track_parts(name: str, track: Track, step: float, level: int) -> list[Part]:
+def _track_tables(name: str, track: Track, step: float) -> list[Table]:
     """Code a track's shares, and the curves of which any channel has a share left."""
     step = float(short(np.array([step]))[0])
     shares = _array(track.shares)
@@ -111,8 +110,8 @@ def _track_parts(name: str, track: Track, step: float, level: int) -> list[Part]
     shared = np.sqrt(np.square(q, dtype=np.float64).mean(axis=(0, 1)))
     fine = FINER / np.maximum(shared, FINER)
     return [
-        plain_part(CURVES + name, curves, fine, level),
-        signed_part(SHARES + name, q.reshape(len(q), -1), step, level),
+        plain_table(CURVES + name, curves, fine),
+        signed_table(SHARES + name, q.reshape(len(q), -1), step),
     ]
 
 

@@ -19,14 +19,7 @@ WRONG = KeyError, TypeError, ValueError, AttributeError, OverflowError
 
 
 def to_bytes(header: Mapping[str, Any], parts: Sequence[Part]) -> bytes:
-    """Return the file of a header, to which the list of parts is added.
-
-    Raises:
-        ValueError: a part is not packed.
-    """
-    for part in parts:
-        if part.unpacked is not None:
-            raise ValueError(f"part '{part.name}' has no stream")
+    """Return the file of a header, to which the list of parts is added."""
     whole = dict(header) | {"parts": [part.described() for part in parts]}
     text = json.dumps(whole, separators=(",", ":"), allow_nan=False).encode()
     return b"".join([_FIXED.pack(MAGIC, VERSION, len(text)), text, *(p.stream for p in parts)])

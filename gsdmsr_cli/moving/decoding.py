@@ -13,7 +13,7 @@ from gsdmsr_cli.gaussians.splats import Splats
 from gsdmsr_cli.moving.baked import COLOURS, OF_BODIES, OF_SPLATS, Baked, Bodies
 from gsdmsr_cli.moving.coding import CURVES, SHARES, TO_YCOCG, in_other_colours
 from gsdmsr_cli.moving.curves import Track
-from gsdmsr_cli.moving.parts import Floats, Part, values_of
+from gsdmsr_cli.moving.parts import Floats, Part, Table, values_of
 from gsdmsr_cli.moving.places import NAME as MEANS
 from gsdmsr_cli.moving.places import places_of
 from gsdmsr_cli.moving.playing import UNSEEN
@@ -21,7 +21,7 @@ from gsdmsr_cli.moving.playing import UNSEEN
 _TO_RGB = np.linalg.inv(TO_YCOCG)
 
 
-def decoded(header: Mapping[str, Any], parts: Mapping[str, Part]) -> Baked:
+def decoded(header: Mapping[str, Any], parts: Mapping[str, Part | Table]) -> Baked:
     """Return what parts say.
 
     Raises:
@@ -84,10 +84,10 @@ def _track_of(name: str, read: _Reader, rows: int, channels: int, times: int) ->
 class _Reader:
     """Parts by name, whose sizes are checked."""
 
-    def __init__(self, parts: Mapping[str, Part]) -> None:
+    def __init__(self, parts: Mapping[str, Part | Table]) -> None:
         self.parts = parts
 
-    def part(self, name: str, rows: int, columns: int) -> Part:
+    def part(self, name: str, rows: int, columns: int) -> Part | Table:
         part = self.parts[name]
         if (part.rows, part.columns) != (rows, columns):
             found = f"{part.rows} x {part.columns}"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -22,14 +22,45 @@ MOST_INFLATED, MOST_HELD = 1100, 1 << 30
 LEVEL = 9
 """Of zlib: the file is written once and fetched often."""
 
-UNPACKED, QUICKLY = 0, 4
-"""Levels for parts of which no more is asked than what they say, which have no stream, or about
-how long it is."""
+QUICKLY = 4
+"""A level for parts of which only is asked how long they are, about."""
+
+
+@dataclass(frozen=True, eq=False)
+class Table:
+    """A table of integers q, each of which stands for ``least`` + ``step`` * q: a part to be.
+
+    Attributes:
+        name: of the part.
+        integers: (rows, columns), 0 or more unless ``signed``.
+        least, step: one number a column, or one for all.
+        signed: whether integers may be below 0.
+        either: whether differences to the row before are packed in their place if that is shorter.
+        extra: what else the header says of it.
+    """
+
+    name: str
+    integers: Integers
+    least: tuple[float, ...]
+    step: tuple[float, ...]
+    signed: bool = False
+    either: bool = False
+    extra: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def rows(self) -> int:
+        """How many there are."""
+        return len(self.integers)
+
+    @property
+    def columns(self) -> int:
+        """How many there are."""
+        return int(self.integers.shape[1])
 
 
 @dataclass(frozen=True)
 class Part:
-    """A table of integers q, each of which stands for ``least`` + ``step`` * q.
+    """A table as a file holds it.
 
     Attributes:
         name: of the part.
@@ -40,7 +71,6 @@ class Part:
         least, step: one number a column, or one for all.
         extra: what else the header says of it.
         stream: the integers, column by column, each as planes from the lowest byte on; deflated.
-        unpacked: the integers themselves, (rows, columns), in place of the stream.
     """
 
     name: str
@@ -53,7 +83,6 @@ class Part:
     step: tuple[float, ...]
     extra: Mapping[str, Any]
     stream: bytes
-    unpacked: Integers | None = None
 
     def described(self) -> dict[str, Any]:
         """Return what the header of the file says of the part."""
@@ -100,84 +129,63 @@ def quantised(values: Floats, least: Floats, step: Floats) -> Integers:
     return np.rint((values - least) / step).astype(np.int64).clip(min=0)
 
 
-def plain_part(name: str, values: Floats, step: float | Floats, level: int = LEVEL) -> Part:
-    """Code values (rows, columns) from the least of each column on, in the shorter of two ways.
+def plain_table(name: str, values: Floats, step: float | Floats) -> Table:
+    """Return values (rows, columns) counted from the least of each column on.
 
     Args:
         name: of the part.
         values: finite.
         step: above 0, one for all columns or one of each.
-        level: of zlib.
     """
     steps = short(np.atleast_1d(np.asarray(step, np.float64)))
     least = short(values.min(axis=0) if len(values) else np.zeros(values.shape[1]))
     q = quantised(values, least, steps)
-    way = _coded(name, q, False, False, least, steps, level)
-    if level == UNPACKED:
-        return way
-    other = _coded(name, q, False, True, least, steps, level)
-    return min(way, other, key=lambda part: len(part.stream))
+    return Table(name, q, tuple(least.tolist()), tuple(steps.tolist()), either=True)
 
 
-def signed_part(name: str, q: Integers, step: float, level: int = LEVEL) -> Part:
-    """Code integers (rows, columns) about 0, which stand for as many times ``step``.
+def signed_table(name: str, q: Integers, step: float) -> Table:
+    """Return integers (rows, columns) about 0, which stand for as many times ``step``.
 
     ``step`` is one of ``short`` numbers.
     """
-    return _coded(name, q, True, False, np.zeros(1), np.full(1, step), level)
+    return Table(name, q, (0.0,), (step,), signed=True)
 
 
-def sums_part(
-    name: str,
-    increments: Integers,
-    least: Floats,
-    step: Floats,
-    extra: Mapping[str, Any],
-    level: int = LEVEL,
-) -> Part:
-    """Code increments (rows, 1), 0 or more, as they are; the reader knows what they add up to."""
-    return _packed(name, increments, False, False, least, step, extra, level)
+def packed(table: Table, level: int = LEVEL) -> Part:
+    """Return a table as a part, at a level of zlib.
+
+    Raises:
+        ValueError: it needs integers of too many bytes.
+    """
+    way = _deflated(table, False, level)
+    if not table.either:
+        return way
+    return min(way, _deflated(table, True, level), key=lambda part: len(part.stream))
 
 
-def _coded(
-    name: str, q: Integers, signed: bool, difference: bool, least: Floats, step: Floats, level: int
-) -> Part:
-    if difference:
-        q = np.diff(q, axis=0, prepend=0)
-    if signed or difference:
+def _deflated(table: Table, difference: bool, level: int) -> Part:
+    q = np.diff(table.integers, axis=0, prepend=0) if difference else table.integers
+    if table.signed or difference:
         q = np.where(q < 0, -2 * q - 1, 2 * q)
-    return _packed(name, q, signed, difference, least, step, {}, level)
-
-
-def _packed(
-    name: str,
-    u: Integers,
-    signed: bool,
-    difference: bool,
-    least: Floats,
-    step: Floats,
-    extra: Mapping[str, Any],
-    level: int,
-) -> Part:
-    rows, columns = u.shape
-    width = max(1, -(-int(u.max(initial=0)).bit_length() // 8))
+    rows, columns = q.shape
+    width = max(1, -(-int(q.max(initial=0)).bit_length() // 8))
     if width > MOST_BYTES:
-        raise ValueError(f"'{name}' needs integers of {width} bytes")
-    limits = tuple(map(float, least)), tuple(map(float, step))
-    if level == UNPACKED:
-        return Part(name, rows, columns, width, signed, difference, *limits, extra, b"", u)
-    planes = np.ascontiguousarray(u.T).astype("<u8").view(np.uint8).reshape(columns, rows, 8)
+        raise ValueError(f"'{table.name}' needs integers of {width} bytes")
+    planes = np.ascontiguousarray(q.T).astype("<u8").view(np.uint8).reshape(columns, rows, 8)
     stream = zlib.compress(planes[:, :, :width].transpose(0, 2, 1).tobytes(), level)
-    return Part(name, rows, columns, width, signed, difference, *limits, extra, stream)
+    flags, limits = (table.signed, difference), (table.least, table.step)
+    return Part(table.name, rows, columns, width, *flags, *limits, table.extra, stream)
 
 
-def integers_of(part: Part) -> Integers:
+def integers_of(part: Part | Table) -> Integers:
     """Return what a part's integers say, (rows, columns): signs and differences are undone.
 
     Raises:
         ValueError: the stream is damaged, or not of this length.
     """
-    u = _inflated(part) if part.unpacked is None else part.unpacked
+    if isinstance(part, Table):
+        return part.integers
+    u = _inflated(part)
     if part.signed or part.difference:
         u = (u >> 1) ^ -(u & 1)
     return np.cumsum(u, axis=0) if part.difference else u
@@ -201,7 +209,7 @@ def _inflated(part: Part) -> Integers:
     return u
 
 
-def values_of(part: Part) -> Floats:
+def values_of(part: Part | Table) -> Floats:
     """Return the values (rows, columns) of a part.
 
     Raises:

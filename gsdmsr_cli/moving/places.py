@@ -5,16 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from gsdmsr_cli.moving.parts import (
-    LEVEL,
-    Floats,
-    Integers,
-    Part,
-    integers_of,
-    quantised,
-    short,
-    sums_part,
-)
+from gsdmsr_cli.moving.parts import Floats, Integers, Part, Table, integers_of, quantised, short
 
 AXES = 3
 MOST_BITS = 16
@@ -36,8 +27,8 @@ def unwarped(values: Floats, warp: float) -> Floats:
 
 
 def code_places(
-    means: Floats, moving: int, step: float, warp: float, level: int = LEVEL
-) -> tuple[Part, NDArray[np.intp]]:
+    means: Floats, moving: int, step: float, warp: float
+) -> tuple[Table, NDArray[np.intp]]:
     """Code centres, each of two blocks in the order of a Morton curve.
 
     Args:
@@ -45,10 +36,9 @@ def code_places(
         moving: length of the first block.
         step: between two neighbouring places, in units of ``warp`` near the origin.
         warp: from about where on steps grow with the distance [world units].
-        level: of zlib.
 
     Returns:
-        The part, and which row of ``means`` each of its rows is.
+        The increments of their codes, and which row of ``means`` each of them is.
     """
     values = warped(means, warp)
     least = short(values.min(axis=0) if len(values) else np.zeros(AXES))
@@ -59,12 +49,12 @@ def code_places(
     blocks = np.split(np.arange(len(means)), [moving])
     order = [block[np.argsort(codes[block], kind="stable")] for block in blocks]
     increments = np.concatenate([np.diff(codes[rows], prepend=0) for rows in order])
-    extra = {"warp": warp}
-    part = sums_part(NAME, increments[:, None], least, np.full(AXES, step), extra, level)
-    return part, np.concatenate(order)
+    limits = tuple(least.tolist()), (step,) * AXES
+    table = Table(NAME, increments[:, None], *limits, extra={"warp": warp})
+    return table, np.concatenate(order)
 
 
-def places_of(part: Part, moving: int) -> Floats:
+def places_of(part: Part | Table, moving: int) -> Floats:
     """Return the centres (N, 3) of a part.
 
     Raises:

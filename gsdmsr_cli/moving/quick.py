@@ -10,6 +10,7 @@ from gsdmsr_cli.model.model import Model
 from gsdmsr_cli.moving.baking import bake
 from gsdmsr_cli.moving.coding import coded, described, steps_named
 from gsdmsr_cli.moving.container import to_bytes
+from gsdmsr_cli.moving.parts import packed
 
 MOST_TIMES = 33
 """At which a model is looked at, or that of each segment of time."""
@@ -29,5 +30,5 @@ def quick_file(model: Model, frames: int, bound: float, further: Mapping[str, An
     """
     segments = len(model.segments) if isinstance(model, Joined) else 1
     baked = bake(model, min(frames, MOST_TIMES * segments))
-    parts = coded(baked, steps_named(baked), bound)
+    parts = [packed(table) for table in coded(baked, steps_named(baked), bound)]
     return to_bytes({**described(baked), **further}, parts)

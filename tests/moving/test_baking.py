@@ -26,7 +26,7 @@ from gsdmsr_cli.moving.baking import bake
 from gsdmsr_cli.moving.coding import coded, described, steps_named
 from gsdmsr_cli.moving.container import from_bytes, to_bytes
 from gsdmsr_cli.moving.decoding import decoded
-from gsdmsr_cli.moving.parts import LEVEL, QUICKLY, UNPACKED, integers_of
+from gsdmsr_cli.moving.parts import QUICKLY, Part, integers_of, packed
 from gsdmsr_cli.moving.playing import model_of
 from gsdmsr_cli.moving.shapes import rotations_and_scales, upright
 
@@ -157,9 +157,13 @@ def test_axes_are_matched_to_those_before() -> None:
         previous = quats
 
 
+def parts_of(baked: Baked, steps: dict[str, float]) -> list[Part]:
+    return [packed(table) for table in coded(baked, steps, FACTS.bound)]
+
+
 def coded_and_back(baked: Baked, factor: float) -> Baked:
     steps = {name: step * factor for name, step in steps_named(baked).items()}
-    data = to_bytes(described(baked), coded(baked, steps, FACTS.bound))
+    data = to_bytes(described(baked), parts_of(baked, steps))
     return decoded(*from_bytes(data))
 
 
@@ -181,17 +185,13 @@ def test_what_is_coded_comes_back_as_fine_as_asked(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["control_points", "multiscale", "covariance_4d", "rigid_groups"])
-def test_parts_say_the_same_however_they_are_packed(name: str) -> None:
+def test_parts_say_what_tables_do_however_they_are_packed(name: str) -> None:
     baked = bake(model_with(name, 30), FACTS.frames)
-    packed, *others = (
-        coded(baked, steps_named(baked), FACTS.bound, level) for level in (LEVEL, QUICKLY, UNPACKED)
-    )
-    for parts in others:
-        for one, other in zip(packed, parts, strict=True):
-            assert (one.name, one.least, one.step) == (other.name, other.least, other.step)
-            assert np.array_equal(integers_of(one), integers_of(other))
-    with pytest.raises(ValueError, match="no stream"):
-        to_bytes(described(baked), others[1])
+    for table in coded(baked, steps_named(baked), FACTS.bound):
+        for part in (packed(table), packed(table, QUICKLY)):
+            assert (part.name, part.least, part.step) == (table.name, table.least, table.step)
+            assert (part.rows, part.columns) == (table.rows, table.columns)
+            assert np.array_equal(integers_of(part), table.integers)
 
 
 def test_coarse_steps_take_fewer_bytes() -> None:
@@ -199,7 +199,7 @@ def test_coarse_steps_take_fewer_bytes() -> None:
     sizes = []
     for factor in (0.25, 1.0, 4.0):
         steps = {name: step * factor for name, step in steps_named(baked).items()}
-        sizes.append(sum(len(part.stream) for part in coded(baked, steps, FACTS.bound)))
+        sizes.append(sum(len(part.stream) for part in parts_of(baked, steps)))
     assert sizes[0] > 1.2 * sizes[1] > 1.4 * sizes[2]
 
 
@@ -208,8 +208,6 @@ def test_coarse_steps_take_fewer_bytes() -> None:
 )
 def test_parts_that_do_not_fit_are_refused(spoilt: dict[str, Any]) -> None:
     baked = bake(model_with("control_points"), FACTS.frames)
-    header, parts = from_bytes(
-        to_bytes(described(baked), coded(baked, steps_named(baked), FACTS.bound))
-    )
+    header, parts = from_bytes(to_bytes(described(baked), parts_of(baked, steps_named(baked))))
     with pytest.raises((ValueError, KeyError)):
         decoded({**header, **spoilt}, parts)

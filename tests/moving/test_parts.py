@@ -16,9 +16,10 @@ from gsdmsr_cli.moving.container import MAGIC, from_bytes, to_bytes
 from gsdmsr_cli.moving.parts import (
     Part,
     integers_of,
+    packed,
     part_of,
-    plain_part,
-    signed_part,
+    plain_table,
+    signed_table,
     values_of,
 )
 from gsdmsr_cli.moving.places import code_places, places_of
@@ -58,7 +59,7 @@ def test_signs_and_differences_are_what_the_format_says() -> None:
 
 @given(tables, st.floats(1e-3, 10.0))
 def test_values_come_back_within_half_a_step(values: NDArray[np.float64], step: float) -> None:
-    part = plain_part("a", values, step)
+    part = packed(plain_table("a", values, step))
     described = json.loads(json.dumps(part.described()))
     again = values_of(part_of(described, part.stream))
     slack = 1e-5 * np.abs(values).max()
@@ -68,12 +69,12 @@ def test_values_come_back_within_half_a_step(values: NDArray[np.float64], step: 
 @given(st.lists(st.integers(-(2**40), 2**40), min_size=1, max_size=30))
 def test_signed_integers_come_back(numbers: list[int]) -> None:
     q = np.array(numbers)[:, None]
-    assert (integers_of(signed_part("a", q, 1.0)) == q).all()
+    assert (integers_of(packed(signed_table("a", q, 1.0))) == q).all()
 
 
 def test_integers_of_more_than_six_bytes_are_refused() -> None:
     with pytest.raises(ValueError, match="7 bytes"):
-        signed_part("a", np.array([[2**50]]), 1.0)
+        packed(signed_table("a", np.array([[2**50]]), 1.0))
 
 
 @given(st.integers(0, 2**32 - 1), st.sampled_from([0.5, 2.0]))
@@ -81,7 +82,8 @@ def test_places_come_back_in_another_order(seed: int, warp: float) -> None:
     rng = np.random.default_rng(seed)
     count = int(rng.integers(0, 50))
     moving, means = int(rng.integers(0, count + 1)), rng.normal(size=(count, 3)) * 3
-    part, order = code_places(means, moving, 1e-3, warp)
+    table, order = code_places(means, moving, 1e-3, warp)
+    part = packed(table)
     assert sorted(order[:moving].tolist()) == list(range(moving))
     again = places_of(part, moving)
     assert again.shape == (count, 3)
@@ -91,12 +93,12 @@ def test_places_come_back_in_another_order(seed: int, warp: float) -> None:
 
 def test_one_place_and_many_at_one_place_are_coded() -> None:
     for count in (1, 5):
-        part, _ = code_places(np.full((count, 3), 0.25), count, 1e-3, 1.0)
-        assert np.allclose(places_of(part, count), 0.25, atol=1e-5)
+        table, _ = code_places(np.full((count, 3), 0.25), count, 1e-3, 1.0)
+        assert np.allclose(places_of(packed(table), count), 0.25, atol=1e-5)
 
 
 def a_file() -> bytes:
-    return to_bytes({"splats": 3}, [plain_part("a", np.arange(6.0).reshape(3, 2), 1.0)])
+    return to_bytes({"splats": 3}, [packed(plain_table("a", np.arange(6.0).reshape(3, 2), 1.0))])
 
 
 def test_a_file_comes_back() -> None:

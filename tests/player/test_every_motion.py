@@ -19,6 +19,7 @@ from gsdmsr_cli.moving.baking import bake
 from gsdmsr_cli.moving.coding import coded, described, steps_named
 from gsdmsr_cli.moving.container import from_bytes, to_bytes
 from gsdmsr_cli.moving.decoding import decoded
+from gsdmsr_cli.moving.parts import packed
 from gsdmsr_cli.moving.playing import model_of
 from gsdmsr_cli.raster import reference
 from gsdmsr_cli.scene.camera import Camera, look_at
@@ -37,7 +38,7 @@ def data(request: pytest.FixtureRequest) -> bytes:
     motion = disturbed(started(request.param, SPLATS))
     with torch.no_grad():
         baked = bake(Model(splats_of(SPLATS), {MOTION: motion}), 12)
-        parts = coded(baked, steps_named(baked), FACTS.bound)
+        parts = [packed(table) for table in coded(baked, steps_named(baked), FACTS.bound)]
     return to_bytes({**described(baked), "scene": SCENE, "about": {}}, parts)
 
 
