@@ -9,14 +9,14 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 from datasets import write_picture
 from numpy.typing import NDArray
 
-from gsdmsr_cli.demo.synthetic import CAMERA_ANGLE_X, CAMERA_RADIUS, camera_on_dome, draw, solids_at
+from gsdmsr_cli.demo.synthetic import CAMERA_RADIUS, camera_on_dome, draw, solids_at
 from gsdmsr_cli.model.layers.cameras import corrected
 from gsdmsr_cli.scene.camera import Camera
 
@@ -48,7 +48,14 @@ class Capture:
 
 
 def write_capture(
-    folder: Path, size: int, frames: int, pixels: float, drift: float, seed: int
+    folder: Path,
+    size: int,
+    frames: int,
+    pixels: float,
+    drift: float,
+    seed: int,
+    focal: float = 1.0,
+    readout: float = 0.0,
 ) -> Capture:
     """Write a capture in D-NeRF's layout.
 
@@ -60,17 +67,24 @@ def write_capture(
             half differs from one frame to the next.
         drift: largest deviation of a colour's factor from 1.
         seed: of the errors and the drift.
+        focal: factor by which the focal length that is told of train and val pictures is wrong.
+        readout: time from the first to the last row of these pictures, of a rolling shutter, as a
+            share of that between two pictures.
     """
     rng = np.random.default_rng(seed)
     times = np.linspace(0, 1, frames)
     true = [_on_path(time, size) for time in times]
     wrong = pose_errors(true, pixels, times, rng)
-    given = [corrected(camera, error) for camera, error in zip(true, wrong, strict=True)]
+    given = [
+        replace(corrected(camera, error), fx=focal * camera.fx, fy=focal * camera.fy)
+        for camera, error in zip(true, wrong, strict=True)
+    ]
     exposures = exposure_drift(times, drift, rng)
     val = np.arange(frames) % 4 == 2
     for split, chosen in (("train", ~val), ("val", val)):
         rows = chosen.nonzero()[0]
-        pictures = [_picture(true[i], times[i], exposures[i]) for i in rows]
+        lasts = readout * (times[1] - times[0])
+        pictures = [_read_by_rows(times[i], size, lasts, exposures[i]) for i in rows]
         _write(folder, split, [given[i] for i in rows], times[rows], pictures)
     aside = times[::4]
     cameras = [_on_path(time, size, OFF_PATH * (-1) ** i) for i, time in enumerate(aside)]
@@ -172,6 +186,25 @@ def _picture(camera: Camera, time: float, exposure: NDArray[np.float64]) -> NDAr
     return np.rint(drawn.clip(0, 255)).astype(np.uint8)
 
 
+def _read_by_rows(
+    time: float, size: int, lasts: float, exposure: NDArray[np.float64]
+) -> NDArray[np.uint8]:
+    """Return a picture on the path whose rows are of times ``lasts`` apart in all."""
+    if not lasts:
+        return _picture(_on_path(time, size), time, exposure)
+    moments = time + lasts * (np.arange(size) / (size - 1) - 0.5)
+    rows = [_picture(_on_path(t, size), t, exposure)[i] for i, t in enumerate(moments)]
+    return np.stack(rows)
+
+
+def skew(size: int, frames: int, readout: float) -> float:
+    """Return by how much places of the scene move while half of the rows are read, rms [px]."""
+    times, half = np.linspace(0, 1, frames), readout / (frames - 1) / 2
+    now, then = (np.stack([_places(_on_path(t, size), _ON_STAGE) for t in times + by])
+                 for by in (0.0, half))  # fmt: skip
+    return float(np.sqrt(np.square(then - now).sum(2).mean()))
+
+
 def _write(
     folder: Path,
     split: str,
@@ -186,5 +219,6 @@ def _write(
         frames.append(
             {"file_path": name, "time": time, "transform_matrix": opengl_pose(camera).tolist()}
         )
-    document = {"camera_angle_x": CAMERA_ANGLE_X, "frames": frames}
+    angle = 2 * math.atan(cameras[0].width / 2 / cameras[0].fx)
+    document = {"camera_angle_x": angle, "frames": frames}
     (folder / f"transforms_{split}.json").write_text(json.dumps(document), encoding="utf-8")

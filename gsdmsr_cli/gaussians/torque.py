@@ -1,7 +1,8 @@
-"""What a loss says of turning and shifting all that is drawn, from its gradients by the splats.
+"""What a loss says of turning and stretching all that is drawn, from its gradients by the splats.
 
 Turning the world about a point, splats and their harmonics with it, is what turning the camera the
-other way does to the picture. So the gradients of a camera need no kernel of their own.
+other way does to the picture, and stretching it along the line of sight what a shorter focal length
+does. So the gradients of a camera need no kernel of their own.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ import functools
 import torch
 from torch import Tensor
 
-from gsdmsr_cli.ground.geometry import sh_basis
+from gsdmsr_cli.ground.geometry import SH_C0, sh_basis
 
 Entry = tuple[int, int, float]
 
@@ -42,6 +43,43 @@ def torque(
         total += _sum(torch.linalg.cross(_finite(axes), d_axes, dim=1).sum(dim=2))
     if d_sh is not None:
         total += _of_harmonics(_finite(sh), d_sh)
+    return total
+
+
+def stretch(
+    means: Tensor,
+    axes: Tensor | None,
+    sh: Tensor,
+    d_means: Tensor | None,
+    d_axes: Tensor | None,
+    d_sh: Tensor | None,
+    centre: Tensor,
+    ahead: Tensor,
+) -> Tensor:
+    """Return the gradient, () float64, by a factor on all distances along a line of sight.
+
+    Of a small step e: means m move by e d d^T (m - c), axes by e d d^T a with the unit vector
+    ``ahead`` (3,), d, and ``centre`` (3,), c; colours stay those that were seen before. Gradients
+    are None where they are 0; shapes are those of forms without axes, of which the covariances are
+    not stretched.
+    """
+    total = torch.zeros((), dtype=torch.float64, device=means.device)
+    along, arms = ahead.to(means), _finite(means) - centre.to(means)
+    moved = (arms @ along)[:, None] * along
+    if d_means is not None:
+        total += (d_means * moved).sum(dtype=torch.float64)
+    if d_axes is not None and axes is not None:
+        both = along @ d_axes, along @ _finite(axes)
+        total += (both[0] * both[1]).sum(dtype=torch.float64)
+    degree = int(sh.shape[1] ** 0.5) - 1
+    if d_sh is not None and degree:
+        distances = arms.norm(dim=1, keepdim=True).clamp(min=torch.finfo(arms.dtype).tiny)
+        ways = arms / distances
+        turned = (moved - (moved * ways).sum(dim=1, keepdim=True) * ways) / distances
+        _, slopes, *_ = torch.func.jvp(lambda d: sh_basis(d, degree), (ways,), (turned,))
+        # the first of the basis is a constant, so its coefficients tell the gradients of colours
+        colours = (slopes[:, :, None] * _finite(sh)).sum(dim=1)
+        total -= (colours * d_sh[:, 0]).sum(dtype=torch.float64) / SH_C0
     return total
 
 

@@ -8,9 +8,9 @@ from kernel_checks import generator
 from torch import Tensor
 
 from gsdmsr_cli.gaussians.splats import Splats
-from gsdmsr_cli.gaussians.torque import torque
+from gsdmsr_cli.gaussians.torque import stretch, torque
 from gsdmsr_cli.gaussians.turning import turn_harmonics
-from gsdmsr_cli.ground.geometry import quat_product
+from gsdmsr_cli.ground.geometry import SH_C0, quat_product, sh_basis
 
 CENTRE = torch.tensor([0.4, -1.2, 0.7], dtype=torch.float64)
 
@@ -73,3 +73,30 @@ def test_splats_that_are_not_finite_have_no_part() -> None:
     for tensor in (splats.means, splats.quats, splats.sh):
         tensor[2] = torch.nan
     assert torch.equal(torque(*given, slopes[0], slopes[1], None, slopes[2], CENTRE), expected)
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_stretching_leaves_the_colours_that_were_seen(degree: int) -> None:
+    """Means and axes go along, directions of colours do not."""
+    splats, axes = random_splats(degree)
+    rng = generator(11)
+    ahead = torch.nn.functional.normalize(torch.randn(3, generator=rng).double(), dim=0)
+    d_colours = torch.randn(6, 3, generator=rng).double()
+    direct, d_axes = (torch.randn(t.shape, generator=rng).double() for t in (splats.means, axes))
+
+    def colours(means: Tensor) -> Tensor:
+        ways = torch.nn.functional.normalize(means - CENTRE, dim=1)
+        return (sh_basis(ways, degree)[:, :, None] * splats.sh).sum(dim=1)
+
+    means = splats.means.clone().requires_grad_()
+    seen = (colours(means) * d_colours).sum() + 0 * means.sum()
+    (by_colours,) = torch.autograd.grad(seen, means)
+    ways = torch.nn.functional.normalize(splats.means - CENTRE, dim=1)
+    d_sh = sh_basis(ways, degree)[:, :, None] * d_colours[:, None]
+    torch.testing.assert_close(d_sh[:, 0], SH_C0 * d_colours)
+    given = splats.means, axes, splats.sh, direct + by_colours, d_axes, d_sh
+    outer = ahead[:, None] * ahead
+    expected = ((splats.means - CENTRE) @ outer * direct).sum() + (outer @ axes * d_axes).sum()
+    torch.testing.assert_close(stretch(*given, CENTRE, ahead), expected, rtol=1e-8, atol=1e-8)
+    nothing = stretch(splats.means, axes, splats.sh, None, None, None, CENTRE, ahead)
+    assert nothing == 0

@@ -18,12 +18,22 @@ DEVICES = {
     "cameras": "[{name: cameras}]",
     "exposure": "[{name: exposure}]",
     "both": "[{name: cameras}, {name: exposure}]",
+    "cameras with focal": "[{name: cameras, focal: true}]",
 }
 """Layers by what a row of the table is called."""
 
-CAPTURES = {"as it should be": (0.0, 0.0), "poses": (1.0, 0.0), "colours": (0.0, 0.2),
-            "poses and colours": (1.0, 0.2)}  # fmt: skip
-"""Error of poses [px] and drift of colours by what is wrong with a capture."""
+CAPTURES = {
+    "as it should be": (0.0, 0.0),
+    "poses": (1.0, 0.0),
+    "colours": (0.0, 0.2),
+    "poses and colours": (1.0, 0.2),
+    "focal length": (0.0, 0.0, 1.03),
+    "poses and focal length": (1.0, 0.0, 1.03),
+    "rolling shutter": (0.0, 0.0, 1.0, 1.0),
+    "slow rolling shutter": (0.0, 0.0, 1.0, 2.0),
+}
+"""By what is wrong: error of poses [px], drift of colours, and for some factor on the focal length,
+and time in which rows are read as a share of that between two pictures."""
 
 SMALL = "splats.count=2500", "density.cap=12000"
 
@@ -46,7 +56,8 @@ def main() -> None:
             lines = []
             for seed in args.seeds:
                 with tempfile.TemporaryDirectory() as folder:
-                    given = args.size, args.frames, *CAPTURES[what], seed
+                    pixels, drift, *more = CAPTURES[what]
+                    given = args.size, args.frames, pixels, drift, seed, *more
                     capture = write_capture(Path(folder), *given)
                     options = [*SMALL, f"layers={DEVICES[name]}", *args.set]
                     trainer = trained(Path(folder), "dnerf", 1.0, args.steps, seed, options)

@@ -29,6 +29,7 @@ class PerView(Layer):
         weight: of the mean square of the numbers.
         since: progress from which they are learnt.
         bound: of the scene [world units].
+        more: parameters of the layer beside those of all such layers.
 
     Attributes:
         beside: see ``ViewRows``.
@@ -46,6 +47,7 @@ class PerView(Layer):
         weight: float,
         since: float,
         bound: float,
+        more: Sequence[Parameter] = (),
     ) -> None:
         self.per, self.weight, self.since, self.bound = per, weight, since, bound
         self.values = torch.zeros(0, *shape)
@@ -56,7 +58,7 @@ class PerView(Layer):
         self._rows: ViewRows | None = None
         names = "times", "poses", "numbers"
         named = [Parameter(name, t) for name, t in zip(names, self._tables(), strict=True)]
-        super().__init__([Parameter("values", self.values, rate=rate), *named])
+        super().__init__([Parameter("values", self.values, rate=rate), *named, *more])
 
     def at(self, moment: Moment, instant: Instant) -> Moment:
         """Return the moment itself."""
@@ -69,7 +71,7 @@ class PerView(Layer):
     def begin_with(self, views: Sequence[tuple[Camera, float]]) -> None:
         """Hold a row of zeros for each view, or each fixed camera."""
         rows = rows_of(views, self.per, self.bound, self.beside)
-        values, times, poses, numbers = self.parameters()
+        values, times, poses, numbers, *_ = self.parameters()
         values.set_values(self.values.new_zeros(rows.count, *self.values.shape[1:]))
         times.set_values(torch.from_numpy(rows.times))
         poses.set_values(torch.from_numpy(rows.poses))

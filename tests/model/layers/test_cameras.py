@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -36,6 +37,13 @@ def layer_of(scale: float = 0.02, dtype: torch.dtype = torch.float64, **options:
     layer.advance(1.0)
     values = scale * torch.randn(len(VIEWS), 6, generator=generator(3))
     layer.parameters()[0].set_values(values.to(dtype))
+    return layer
+
+
+def focal_layer(dtype: torch.dtype = torch.float64) -> Cameras:
+    """Return such a layer with a focal length that is 5 % longer."""
+    layer = layer_of(0.05, dtype, focal=True)
+    layer.parameters()[-1].set_values(torch.tensor([math.log(1.05)], dtype=dtype))
     return layer
 
 
@@ -104,6 +112,77 @@ def test_the_engine_of_the_cpu_gives_the_same(with_axes: bool) -> None:
     loss = loss_of(layer, moment_of(2, with_axes, single), weights_of(single), "cpu")
     (found,) = torch.autograd.grad(loss, layer.values)
     torch.testing.assert_close(found.double(), expected, rtol=1e-3, atol=1e-4)
+
+
+@pytest.mark.parametrize("with_axes", [False, True])
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_gradients_by_the_focal_length_are_those_of_differences(
+    degree: int, with_axes: bool
+) -> None:
+    layer, moment, weights = focal_layer(), moment_of(degree, with_axes), weights_of()
+    assert layer.log_focals is not None
+    (found,) = torch.autograd.grad(loss_of(layer, moment, weights), layer.log_focals)
+    start, eps = float(layer.log_focals), 1e-6
+
+    def value(by: float) -> float:
+        layer.parameters()[-1].set_values(torch.tensor([start + by], dtype=torch.float64))
+        with torch.no_grad():
+            return float(loss_of(layer, moment, weights))
+
+    expected = (value(eps) - value(-eps)) / (2 * eps)
+    torch.testing.assert_close(float(found), expected, rtol=2e-5, atol=2e-6)
+
+
+def test_the_engine_of_the_cpu_gives_the_same_of_the_focal_length() -> None:
+    exact, single = focal_layer(), torch.float32
+    assert exact.log_focals is not None
+    loss = loss_of(exact, moment_of(2, False), weights_of())
+    expected = torch.autograd.grad(loss, [exact.log_focals, exact.values])
+    layer = focal_layer(single)
+    assert layer.log_focals is not None
+    loss = loss_of(layer, moment_of(2, False, single), weights_of(single), "cpu")
+    found = torch.autograd.grad(loss, [layer.log_focals, layer.values])
+    for one, other in zip(found, expected, strict=True):
+        torch.testing.assert_close(one.double(), other, rtol=1e-3, atol=1e-4)
+
+
+def test_what_is_drawn_and_its_other_gradients_stay_with_a_focal_length() -> None:
+    layer, moment, weights = focal_layer(), moment_of(1, False), weights_of()
+    own = [*moment.splats.tensors().values()]
+    drawn = loss_of(layer, moment, weights)
+    found = torch.autograd.grad(drawn, own)
+    layer.advance(0.0)
+    plain = loss_of(layer, moment, weights)
+    torch.testing.assert_close(drawn, plain)
+    for one, other in zip(found, torch.autograd.grad(plain, own), strict=True):
+        torch.testing.assert_close(one, other)
+
+
+def test_views_of_the_path_share_a_focal_length_and_strange_ones_have_none() -> None:
+    layer = focal_layer()
+    camera, time = VIEWS[1]
+    placed = layer.place(camera, time)
+    assert (placed.fx, placed.fy) == pytest.approx((1.05 * camera.fx, 1.05 * camera.fy))
+    between = layer.place(corrected(camera, np.full(6, 0.01)), 0.3)
+    assert between.fx == pytest.approx(1.05 * camera.fx)
+    far = replace(camera, world_to_camera=look_at(np.array([-3.0, 0.0, 1.0]), np.zeros(3), UP))
+    assert layer.place(far, 0.5) is far
+    assert layer.tell_views(VIEWS)["focal_factors"] == pytest.approx([1.05])
+    squares = layer.values.square().sum(dim=1).mean() + math.log(1.05) ** 2
+    penalty = layer.penalty(moment_of(0, False), Instant(0.0), generator())
+    assert penalty is not None
+    torch.testing.assert_close(penalty, 0.1 * squares)
+
+
+def test_each_fixed_camera_has_a_focal_length_of_its_own() -> None:
+    layer = started_layer("cameras", focal=True)
+    assert isinstance(layer, Cameras) and layer.log_focals is not None
+    rig = [(camera, time) for camera, _ in VIEWS[:3] for time in (0.0, 0.5, 1.0)]
+    layer.begin_with(rig)
+    assert layer.log_focals.shape == (3,)
+    layer.parameters()[-1].set_values(torch.tensor([0.1, 0.0, -0.1]))
+    found = [layer.place(camera, 0.2).fx / camera.fx for camera, _ in VIEWS[:4]]
+    assert found == pytest.approx([math.exp(0.1), 1.0, math.exp(-0.1), 1.0])
 
 
 def test_what_is_drawn_and_its_other_gradients_stay() -> None:
@@ -175,6 +254,14 @@ def test_a_file_has_a_correction_for_every_view() -> None:
     layer = started_layer("cameras")
     layer.restore(file, 1)
     assert isinstance(layer, Cameras) and layer.rows.weights(*VIEWS[3]) == ((3, 1.0),)
+    with_focal = {n: t.detach().clone() for n, t in focal_layer(torch.float32).tensors().items()}
+    other = started_layer("cameras", focal=True)
+    other.restore(with_focal, 1)
+    assert other.place(*VIEWS[3]).fx == pytest.approx(1.05 * VIEWS[3][0].fx)
+    with pytest.raises(ValueError, match="nothing for 'log_focals'"):
+        other.restore(file, 1)
+    with pytest.raises(ValueError, match=r"focal lengths of shape \(2,\), not \(1,\)"):
+        other.restore(with_focal | {"log_focals": torch.zeros(2)}, 1)
     for broken in (
         {"values": torch.zeros(4, 6)},
         {"values": torch.zeros(5, 4)},
