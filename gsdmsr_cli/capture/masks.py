@@ -126,8 +126,11 @@ def _read(path: Path, inverted: bool, frames: Frames, original: Path) -> Mask:
     return ~white if inverted else white
 
 
-def write_mask(path: Path, moving: Mask) -> None:
-    """Write an (H, W) mask as a picture, white where it is true."""
+def write_mask(path: Path, moving: Mask, size: tuple[int, int] | None = None) -> None:
+    """Write an (H, W) mask as a picture, white where it is true; enlarged to (width, height)."""
+    if size is not None:
+        large = cv2.resize(moving.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
+        moving = np.asarray(large) > 0
     write_png(path, np.where(moving, 255, 0).astype(np.uint8)[..., None])
 
 

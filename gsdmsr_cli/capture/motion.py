@@ -58,8 +58,7 @@ def write_found_masks(
         on_progress(i + 1, len(found.names))
     for name in frames.names:
         small = masks.get(name, np.zeros((height, width), bool))
-        large = cv2.resize(small.astype(np.uint8), frames.size, interpolation=cv2.INTER_NEAREST)
-        write_mask(folder / name, np.asarray(large) > 0)
+        write_mask(folder / name, small, frames.size)
     write_json(folder / NOTE, {"missing": [n for n in frames.names if n not in masks]})
 
 

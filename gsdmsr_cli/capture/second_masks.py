@@ -80,9 +80,7 @@ def write_second_masks(
         shown = (_resized(of(view), camera) for of in (standing.draw, standing.true))
         colours = beyond(*shown) / DIFFERENT
         moving = cleaned(np.minimum(flow, 1) + np.minimum(colours, 1) > ENOUGH)
-        whole = view.camera.width, view.camera.height
-        large = cv2.resize(moving.astype(np.uint8), whole, interpolation=cv2.INTER_NEAREST)
-        write_mask(folder / _name(view), np.asarray(large) > 0)
+        write_mask(folder / _name(view), moving, (view.camera.width, view.camera.height))
         on_progress(i + 1, len(views))
 
 
