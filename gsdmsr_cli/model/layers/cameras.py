@@ -54,7 +54,8 @@ class Options:
         weight: of the mean over the corrections of their squared numbers, which holds them to 0.
         since: progress from which they are learnt, once the static phase is over.
         focal: whether the focal length is learnt too: one factor for all pictures, or of each fixed
-            camera; its logarithm has the rate and the weight of the others.
+            camera, which nothing holds to 1.
+        focal_rate: learning rate of its logarithm at the start and the end.
     """
 
     per: Per = "auto"
@@ -62,11 +63,13 @@ class Options:
     weight: float = 0.1
     since: float = 0.05
     focal: bool = False
+    focal_rate: tuple[float, float] = (3e-3, 3e-4)
 
     def __post_init__(self) -> None:
         require(self, "weight", self.weight >= 0, "0 or more")
         require_progress(self, "since")
         require_rates(self, "rate")
+        require_rates(self, "focal_rate")
 
 
 class Cameras(PerView):
@@ -89,11 +92,12 @@ class Cameras(PerView):
         weight: float,
         since: float,
         bound: float,
-        focal: bool,
+        focal_rate: tuple[float, float] | None,
     ) -> None:
-        self.log_focals = torch.zeros(1) if focal else None
-        held = self.log_focals
-        more = [] if held is None else [Parameter("log_focals", held, rate=rate)]
+        self.log_focals, more = None, []
+        if focal_rate is not None:
+            self.log_focals = torch.zeros(1)
+            more.append(Parameter("log_focals", self.log_focals, rate=focal_rate))
         super().__init__(per, (6,), rate, weight, since, bound, more)
 
     def begin_with(self, views: Sequence[tuple[Camera, float]]) -> None:
@@ -161,15 +165,6 @@ class Cameras(PerView):
             own, log_focal, placed, splats.means, splats.quats, splats.sh, axes
         )
         return replace(moment, splats=replace(splats, means=means, quats=quats, sh=sh), axes=axes)
-
-    def penalty(
-        self, moment: Moment, instant: Instant, generator: torch.Generator
-    ) -> Tensor | None:
-        """Return the weighted mean squares of the corrections and of the focal lengths' factors."""
-        found = super().penalty(moment, instant, generator)
-        if found is None or self.log_focals is None:
-            return found
-        return found + self.weight * self.log_focals.square().mean()
 
     def tell_views(self, views: Sequence[tuple[Camera, float]]) -> dict[str, Any]:
         """Return how views are drawn, of which kinds how many there are."""
@@ -289,4 +284,5 @@ def _cross(vector: Tensor) -> Tensor:
 def start(options: Options, facts: Facts, splats: Splats, generator: torch.Generator) -> Cameras:
     """Return corrections that change nothing until they have been trained."""
     o = options
-    return Cameras(o.per, o.rate, o.weight, o.since, facts.bound, o.focal)
+    focal_rate = o.focal_rate if o.focal else None
+    return Cameras(o.per, o.rate, o.weight, o.since, facts.bound, focal_rate)
