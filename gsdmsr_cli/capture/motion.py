@@ -15,7 +15,7 @@ from gsdmsr_cli.capture.reconstruction import Reconstruction
 from gsdmsr_cli.ground.files import write_json
 from gsdmsr_cli.ground.progress import OnProgress
 from gsdmsr_cli.scene.native import cv2
-from gsdmsr_cli.scene.optical_flow import Grey, ends_of, optical_flow, trusted
+from gsdmsr_cli.scene.optical_flow import Floats32, Grey, ends_of, optical_flow, trusted
 
 LONGEST = 640
 """Longer side at which flow is computed [px]."""
@@ -51,9 +51,9 @@ def write_found_masks(
     pixels = np.stack(np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), axis=-1)
     lens = found.lens.resized(width, height)
     rays = rays_of(lens, pixels.reshape(-1, 2).astype(np.float32)).reshape(height, width, 2)
-    masks, spacing = {}, max(1, round(len(greys) / keyframes))
+    masks, spacing, flows = {}, max(1, round(len(greys) / keyframes)), Flows(greys)
     for i, name in enumerate(found.names):
-        off = off_camera(i, greys, rays, found.poses, spacing)
+        off = off_camera(i, flows, rays, found.poses, spacing)
         masks[name] = cleaned(off * lens.fx > OFF)
         on_progress(i + 1, len(found.names))
     for name in frames.names:
@@ -68,9 +68,33 @@ def _grey(path: Path, width: int, height: int) -> Grey:
     return np.asarray(cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
 
 
+class Flows:
+    """Optical flow between frames, which is kept until the later of two frames asks for it.
+
+    Args:
+        greys: (H, W) pictures of all frames, in the order of time, in which they ask.
+    """
+
+    def __init__(self, greys: Sequence[Grey]) -> None:
+        self.greys = greys
+        self._kept: dict[tuple[int, int], tuple[Floats32, Floats32]] = {}
+
+    def there_and_back(self, i: int, j: int) -> tuple[Floats32, Floats32]:
+        """Return the flow (H, W, 2) from frame i to j, and that from j to i [px]."""
+        if (known := self._kept.pop((j, i), None)) is not None:
+            return known[1], known[0]
+        found = (
+            optical_flow(self.greys[i], self.greys[j]),
+            optical_flow(self.greys[j], self.greys[i]),
+        )
+        if j > i:
+            self._kept[i, j] = found
+        return found
+
+
 def off_camera(
     i: int,
-    greys: Sequence[Grey],
+    flows: Flows,
     rays: NDArray[np.float64],
     poses: Sequence[NDArray[np.float64]] | NDArray[np.float64],
     spacing: int,
@@ -81,27 +105,28 @@ def off_camera(
 
     Args:
         i: the frame.
-        greys: (H, W) pictures of all frames, in the order of time.
+        flows: between all frames.
         rays: (H, W, 2) directions of the pixels.
         poses: (4, 4) world-to-camera, of all frames.
         spacing: of keyframes [frames].
     """
-    others = [i + spacing * step for step in NEIGHBOURS if 0 <= i + spacing * step < len(greys)]
+    count = len(flows.greys)
+    others = [i + spacing * step for step in NEIGHBOURS if 0 <= i + spacing * step < count]
     votes = [
-        _off_lines(greys[i], greys[j], rays, essential_matrix(poses[i], poses[j])) for j in others
+        _off_lines(*flows.there_and_back(i, j), rays, essential_matrix(poses[i], poses[j]))
+        for j in others
     ]
-    return np.asarray(np.mean(votes or [np.zeros(greys[i].shape)], axis=0))
+    return np.asarray(np.mean(votes or [np.zeros(flows.greys[i].shape)], axis=0))
 
 
 def _off_lines(
-    here: Grey, there: Grey, rays: NDArray[np.float64], essential: NDArray[np.float64]
+    forward: Floats32, back: Floats32, rays: NDArray[np.float64], essential: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Return how far each pixel's flow ends from its epipolar line, (H, W), in units of rays.
 
     0 where the flow is not to be trusted.
     """
-    height, width = here.shape
-    forward, back = optical_flow(here, there), optical_flow(there, here)
+    height, width = forward.shape[:2]
     to_x, to_y = ends_of(forward)
     seen = cv2.remap(rays.astype(np.float32), to_x, to_y, cv2.INTER_LINEAR)
     distances = sampson_distance(

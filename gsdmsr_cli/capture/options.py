@@ -29,6 +29,8 @@ class Options:
         matching: which frames are compared: neighbours in time, all, or neighbours and, of a few
             evenly chosen, all; ``auto`` is exhaustive for small folders of pictures.
         auto_mask: whether masks of what moves are computed, with the cameras of a first pass.
+        mark_motion: whether masks of what moves in a video are computed, by the cameras that are
+            found, where there are no others.
         mapping: COLMAP's global mapper or its incremental one.
         min_registered: share of the frames whose cameras must be found.
         test_every: every so many frames one is kept for testing; 0 keeps none. Of a rig it is the
@@ -44,6 +46,7 @@ class Options:
     camera_model: str = "SIMPLE_RADIAL"
     matching: str = "auto"
     auto_mask: bool = False
+    mark_motion: bool = True
     mapping: str = "global"
     min_registered: float = 0.75
     test_every: int = 8

@@ -95,6 +95,8 @@ def prepare(
     cameras = pipeline.find_cameras(frames, features, moving)
     found = cameras.found
     require_registered(frames, found, options.min_registered)
+    if moving is None and options.mark_motion and source.kind == "video":
+        moving, masked_by = pipeline.find_masks(frames, cameras), "found"
     with show_progress("judging the cameras"):
         matches = cameras.matches
         shares = moving_share(matches, cameras.of_keyframes), turning_share(matches, found.lens)
@@ -232,13 +234,13 @@ class _Pipeline:
 
         return self.run("masks", take, masks=digest(masks.folder, masks.inverted))
 
-    def find_masks(self, frames: Frames, first: Cameras) -> Path:
-        """Return the folder of masks of what disagrees with the cameras of a first pass."""
+    def find_masks(self, frames: Frames, by: Cameras) -> Path:
+        """Return the folder of masks of what disagrees with cameras."""
 
         def find(folder: Path) -> None:
             with self.show_progress("finding what moves") as on_progress:
-                keyframes = len(first.of_keyframes.names)
-                write_found_masks(folder, frames, first.found, keyframes, on_progress)
+                keyframes = len(by.of_keyframes.names)
+                write_found_masks(folder, frames, by.found, keyframes, on_progress)
 
         return self.run("masks", find, masks="found")
 

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsdmsr_cli.capture.masks import write_mask
-from gsdmsr_cli.capture.motion import LONGEST, OFF, cleaned, off_camera
+from gsdmsr_cli.capture.motion import LONGEST, OFF, Flows, cleaned, off_camera
 from gsdmsr_cli.capture.options import Options
 from gsdmsr_cli.ground.errors import DataError
 from gsdmsr_cli.ground.progress import OnProgress
@@ -72,11 +72,11 @@ def write_second_masks(
     camera = _small(views[0].camera)
     pixels = np.stack(np.meshgrid(*(np.arange(n) + 0.5 for n in (camera.width, camera.height))), -1)
     rays = (pixels - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
-    greys = [_grey(_resized(standing.true(view), camera)) for view in views]
+    flows = Flows([_grey(_resized(standing.true(view), camera)) for view in views])
     poses = [view.camera.world_to_camera for view in views]
     spacing = max(1, round(len(views) / Options.keyframes))
     for i, view in enumerate(views):
-        flow = off_camera(i, greys, rays, poses, spacing) * camera.fx / OFF
+        flow = off_camera(i, flows, rays, poses, spacing) * camera.fx / OFF
         shown = (_resized(of(view), camera) for of in (standing.draw, standing.true))
         colours = beyond(*shown) / DIFFERENT
         moving = cleaned(np.minimum(flow, 1) + np.minimum(colours, 1) > ENOUGH)

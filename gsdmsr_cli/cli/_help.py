@@ -14,7 +14,7 @@ PANELS = {
     "Cameras": (
         "features", "camera_model", "matching", "mapping", "min_registered",
     ),
-    "Masks": ("masks", "invert_masks", "auto_mask"),
+    "Masks": ("masks", "invert_masks", "auto_mask", "no_mark_motion"),
     "Metrics": ("lpips_weights", "lpips_inria"),
     "Gates": ("fail_under", "fail_over", "baseline", "tolerance", "junit", "github_summary"),
     "Pictures": ("output", "video", "size", "scale", "supersample", "fps"),

@@ -60,7 +60,10 @@ def prepare(
         bool, typer.Option("--invert-masks", help="Black is what moves in --masks.")
     ] = False,
     auto_mask: Annotated[
-        bool, typer.Option("--auto-mask", help="Look for what moves, in a first pass.")
+        bool, typer.Option("--auto-mask", help="Find cameras again without what moves.")
+    ] = False,
+    no_mark_motion: Annotated[
+        bool, typer.Option("--no-mark-motion", help="Mask nothing that moves in a video.")
     ] = False,
     masks_of: Annotated[
         Path | None,
@@ -111,6 +114,7 @@ def prepare(
         camera_model=camera_model,
         matching=matching,
         auto_mask=auto_mask,
+        mark_motion=not no_mark_motion,
         mapping=mapping,
         min_registered=min_registered,
         test_every=test_every,

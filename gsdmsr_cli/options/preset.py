@@ -193,6 +193,8 @@ class LossOptions:
         ssim_until: progress up to which the SSIM term counts; later w is 0.
         inliers: share of a picture's pixels whose errors are taken to be normal; areas with larger
             ones are left out, such as people who walk by; 1 leaves out nothing.
+        moving_weight: by how much more those pixels count of which a view's mask says that they
+            move; 0 is as much as others.
         terms: further terms, each a "name" and the options that its own file declares, see
             ``training.losses``.
     """
@@ -200,6 +202,7 @@ class LossOptions:
     ssim: float = 0.2
     ssim_until: float = 0.3
     inliers: float = 1.0
+    moving_weight: float = 0.0
     terms: tuple[dict[str, Any], ...] = ()
 
     def __post_init__(self) -> None:
@@ -208,6 +211,7 @@ class LossOptions:
         require(self, "ssim", 0.0 <= self.ssim <= 1.0, "a weight from 0 to 1")
         require_progress(self, "ssim_until")
         require(self, "inliers", 0.0 < self.inliers <= 1.0, "a share above 0, up to 1")
+        require_at_least(self, 0, "moving_weight")
 
 
 @dataclass(frozen=True)

@@ -72,3 +72,26 @@ def test_pixels_are_looked_at_from_their_centres_in_the_size_they_have(
         mask = read_mask(out / name)
         assert mask.shape == (HEIGHT, WIDTH) and not mask.any()
     assert json.loads((out / NOTE).read_text()) == {"missing": ["3.png"]}
+
+
+def test_flow_between_two_frames_is_computed_once_and_then_forgotten(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    rng = np.random.default_rng(0)
+    greys = [rng.integers(0, 255, (24, 32), dtype=np.uint8) for _ in range(9)]
+    expected = {
+        (i, j): motion.optical_flow(greys[i], greys[j])
+        for i in range(9) for j in range(9) if abs(i - j) in (2, 4)
+    }  # fmt: skip
+    asked: list[tuple[np.ndarray, np.ndarray]] = []
+    compute = motion.optical_flow
+    monkeypatch.setattr(motion, "optical_flow", lambda *p: (asked.append(p), compute(*p))[1])
+    flows = motion.Flows(greys)
+    for i in range(9):
+        for j in (i - 4, i - 2, i + 2, i + 4):
+            if 0 <= j < 9:
+                forward, back = flows.there_and_back(i, j)
+                np.testing.assert_array_equal(forward, expected[i, j])
+                np.testing.assert_array_equal(back, expected[j, i])
+    assert len(asked) == len(expected)
+    assert not flows._kept

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from gsdmsr_cli.gaussians.frame import Frame
 from gsdmsr_cli.gaussians.moment import Moment
+from gsdmsr_cli.ground.ssim import REACH
 from gsdmsr_cli.model.layer import Instant
 from gsdmsr_cli.model.model import Model
 from gsdmsr_cli.ops.photometric import photometric_loss, tile_errors
@@ -17,6 +18,18 @@ from gsdmsr_cli.raster import Comparing, ComparingViews, Engine
 from gsdmsr_cli.scene.camera import Camera
 from gsdmsr_cli.training.gradients.inliers import inliers
 from gsdmsr_cli.training.gradients.phase import ViewGradients
+
+
+class Moving(NamedTuple):
+    """Pixels of a view that count more than others.
+
+    Attributes:
+        mask: (H, W) bool, those that move.
+        weight: by how much more they count.
+    """
+
+    mask: Tensor
+    weight: float
 
 
 def gradients_of(loss: Tensor, model: Model) -> Sequence[Tensor | None]:
@@ -48,6 +61,7 @@ def compare(
     normal: float = 1.0,
     screens: bool = True,
     further: Tensor | None = None,
+    moving: Moving | None = None,
 ) -> ViewGradients:
     """Draw what a model is at a moment, let it shade the frame, and compare that with a target.
 
@@ -66,8 +80,10 @@ def compare(
         normal: share of the pixels whose errors are taken to be normal, see ``inliers``.
         screens: whether the gradients on the screen are wanted.
         further: what is added to the loss, (), differentiable by the moment; or None.
+        moving: pixels that count more, or None.
     """
-    whole = counted is None and normal == 1 and moment.features is None and not model.shades
+    whole = counted is None and moving is None and normal == 1
+    whole = whole and moment.features is None and not model.shades
     if whole and isinstance(engine, Comparing):
         found = engine.compare(
             moment, camera, background, target, ssim_weight, sh_degree, tile_weights
@@ -76,7 +92,7 @@ def compare(
         size, gradients = (camera.width, camera.height), gradients_of(loss, model)
         return ViewGradients(loss.detach(), gradients, found.on_screen, size, found.errors)
     frame = model.shade(engine.rasterize(moment, camera, background, sh_degree), instant)
-    judged = judge(frame, target, ssim_weight, tile_weights, counted, normal)
+    judged = judge(frame, target, ssim_weight, tile_weights, counted, normal, moving)
     return differentiate(judged, frame, model, screens, further)
 
 
@@ -162,10 +178,12 @@ def judge(
     tile_weights: Tensor | None = None,
     counted: Tensor | None = None,
     normal: float = 1.0,
+    moving: Moving | None = None,
 ) -> Judged:
     """Compare a frame that has been drawn with a target, as ``Comparing.compare`` does.
 
-    Pixels that do not count are taken for right, also by the windows of SSIM.
+    Pixels that do not count are taken for right, also by the windows of SSIM. What moves counts
+    once with all, and again as if all else were right.
     """
     rgb = frame.rgb
     if counted is not None:
@@ -173,8 +191,13 @@ def judge(
     if normal < 1:
         rgb = _right_outside(inliers(rgb, target, normal), rgb, target)
     errors = None if ssim_weight > 0 else tile_errors(rgb, target)
+    if moving is not None and errors is not None:
+        alone = _right_outside(moving.mask, rgb, target)
+        errors = errors + moving.weight * tile_errors(alone, target)
     if errors is None or tile_weights is None:
         loss = unweighted = photometric_loss(rgb, target, ssim_weight)
+        if moving is not None:
+            loss = unweighted = loss + _of_moving(rgb, target, ssim_weight, moving)
     else:
         errors = errors * (tile_weights > 0)
         loss = ((errors * tile_weights).sum() / target.numel()).to(rgb.dtype)
@@ -186,3 +209,23 @@ def _right_outside(counted: Tensor, rgb: Tensor, target: Tensor) -> Tensor:
     """Return the picture with the true colours wherever a pixel (H, W) does not count."""
     true = target.permute(1, 2, 0).to(rgb) / 255
     return torch.where(counted.to(rgb.device)[..., None], rgb, true)
+
+
+def _of_moving(rgb: Tensor, target: Tensor, ssim_weight: float, moving: Moving) -> Tensor:
+    """Return the weighted loss of a picture of which all is right but what moves.
+
+    Only the box around that is looked at, wider by what windows of SSIM reach on either side: what
+    they see beyond it is right.
+    """
+    rows, columns = (moving.mask.any(dim=dim).nonzero()[:, 0].tolist() for dim in (1, 0))
+    if not rows:
+        return rgb.new_zeros(())
+    height, width = moving.mask.shape
+    top, bottom = max(rows[0] - 2 * REACH, 0), min(rows[-1] + 2 * REACH + 1, height)
+    left, right = max(columns[0] - 2 * REACH, 0), min(columns[-1] + 2 * REACH + 1, width)
+    box = slice(top, bottom), slice(left, right)
+    wanted = target[:, box[0], box[1]].contiguous()
+    shown = _right_outside(moving.mask[box], rgb[box], wanted)
+    share = (bottom - top) * (right - left) / (height * width)
+    loss: Tensor = moving.weight * share * photometric_loss(shown, wanted, ssim_weight)
+    return loss

@@ -21,8 +21,8 @@ from gsdmsr_cli.options.preset import BACKGROUNDS, Preset
 from gsdmsr_cli.raster import ComparingViews, Engine
 from gsdmsr_cli.scene.camera import Camera
 from gsdmsr_cli.scene.pictures import HalvedPictures, Pictures, ResidentPictures
-from gsdmsr_cli.scene.scene import MASK, View
-from gsdmsr_cli.training.gradients.compare import compare, compare_views, sum_of
+from gsdmsr_cli.scene.scene import MASK, MOVING, View
+from gsdmsr_cli.training.gradients.compare import Moving, compare, compare_views, sum_of
 from gsdmsr_cli.training.gradients.depth_terms import add_depth_terms
 from gsdmsr_cli.training.gradients.phase import Order, Phase, ViewGradients
 from gsdmsr_cli.training.gradients.replays import Replays, ViewInputs, recorder_for
@@ -43,6 +43,7 @@ class _Look(NamedTuple):
     camera: Camera
     target: Tensor
     mask: Tensor | None
+    moving: Moving | None
     others: tuple[Instant | None, ...]
 
     @property
@@ -99,7 +100,8 @@ class TrainingRenderer:
         size. Terms of the loss are asked of one view after the other.
         """
         losses = self.preset.losses
-        whole = not any(MASK in view.signals for view in self.views)
+        masks = {MASK, MOVING} if losses.moving_weight else {MASK}
+        whole = not any(masks & view.signals.keys() for view in self.views)
         return whole and not (losses.terms or losses.inliers < 1 or model.shades)
 
     def gradients(self, model: Model, orders: Sequence[Order], phase: Phase) -> list[ViewGradients]:
@@ -130,11 +132,19 @@ class TrainingRenderer:
             for time, weight in zip(times, weights, strict=True)
         )
         target, mask = self._resident.load(pictures, view), pictures.signal(view, MASK)
-        return _Look(order, view, pictures, instant, camera, target, mask, others)
+        moving = self._moving(pictures, view)
+        return _Look(order, view, pictures, instant, camera, target, mask, moving, others)
+
+    def _moving(self, pictures: Pictures | HalvedPictures, view: View) -> Moving | None:
+        """Return the pixels of a view that count more than others, None if none do."""
+        weight = self.preset.losses.moving_weight
+        mask = pictures.signal(view, MOVING) if weight else None
+        return None if mask is None else Moving(mask, weight)
 
     def _can_be_at_once(self, model: Model, looks: Sequence[_Look]) -> bool:
         able = isinstance(self.engine, ComparingViews) and not model.shades
-        whole = self.preset.losses.inliers == 1 and all(look.mask is None for look in looks)
+        whole = self.preset.losses.inliers == 1
+        whole = whole and all(look.mask is None and look.moving is None for look in looks)
         weights = [look.order.tile_weights for look in looks]
         return able and whole and _alike([look.camera for look in looks], weights)
 
@@ -217,6 +227,7 @@ class TrainingRenderer:
             self.background, look.target, self._ssim_weight(phase.progress, phase.frozen),
             self._sh_degree(phase.progress), self._on_device(look.order.tile_weights), look.mask,
             self.preset.losses.inliers, phase.screens, self._further(model, look, moments, phase),
+            look.moving,
         )  # fmt: skip
         return self._with_depth_terms(found, model, look, moment, phase)
 

@@ -17,7 +17,7 @@ from gsdmsr_cli.model.model import STORED_AS, Model
 from gsdmsr_cli.ops.photometric import photometric_loss_twin
 from gsdmsr_cli.raster import load_engine
 from gsdmsr_cli.scene.camera import Camera
-from gsdmsr_cli.training.gradients.compare import compare
+from gsdmsr_cli.training.gradients.compare import Moving, compare
 from gsdmsr_cli.training.gradients.inliers import inliers
 from gsdmsr_cli.training.gradients.phase import ViewGradients
 from gsdmsr_cli.training.trainer import Trainer
@@ -45,12 +45,13 @@ def compared(
     normal: float = 1.0,
     screens: bool = True,
     further: Tensor | None = None,
+    moving: Moving | None = None,
 ) -> ViewGradients:
     model: Model = trainer.model
     camera: Camera = trainer.renderer.pictures.camera(trainer.views[0])
     return compare(
         load_engine(engine), model, Moment(model.splats), Instant(0.0), camera, BACKGROUND, target,
-        ssim, 1, weights, counted, normal, screens, further,
+        ssim, 1, weights, counted, normal, screens, further, moving,
     )  # fmt: skip
 
 
@@ -78,6 +79,55 @@ def test_pixels_that_do_not_count_are_taken_for_right(
     expected = photometric_loss_twin(rgb, target, ssim).item()
     found = compared(trainer, target, ssim, counted, engine).loss.item()
     assert found == pytest.approx(expected, rel=1e-4)
+
+
+@pytest.mark.parametrize("box", [(0, 9, 0, 7), (19, 30, 22, 25), (30, 48, 40, 48), (0, 48, 0, 48)])
+@pytest.mark.parametrize("ssim", [0.0, 0.2])
+@pytest.mark.parametrize("engine", ["cpu", "reference"])
+def test_what_moves_counts_again_as_if_all_else_were_right(
+    trainer: Trainer, ssim: float, engine: str, box: tuple[int, int, int, int]
+) -> None:
+    """Loss and gradients, whatever part of the picture has to be looked at for that."""
+    target = trainer.renderer.pictures.load(trainer.views[0])
+    top, bottom, left, right = box
+    mask = torch.zeros(target.shape[1:], dtype=torch.bool)
+    mask[top:bottom, left:right] = True
+    mask[top + 3, left + 2] = False
+    frame = drawn(trainer)
+    rgb, true = frame.rgb.double(), target.permute(1, 2, 0).double() / 255
+    alone = torch.where(mask[..., None], rgb, true)
+    loss = photometric_loss_twin(rgb, target, ssim) + 3 * photometric_loss_twin(alone, target, ssim)
+    wanted = [*trainer.model.trained().values(), frame.means2d]
+    expected = torch.autograd.grad(loss, wanted, allow_unused=True)
+    found = compared(trainer, target, ssim, None, engine, moving=Moving(mask, 3.0))
+    assert found.loss.item() == pytest.approx(loss.item(), rel=1e-4)
+    for one, other in zip((*found.gradients, found.on_screen), expected, strict=True):
+        assert (one is None) == (other is None)
+        if one is not None and other is not None:
+            atol = 2e-3 * float(other.abs().max()) + 1e-8
+            torch.testing.assert_close(one, other, rtol=1e-2, atol=atol)
+
+
+def test_what_moves_counts_more_in_tiles_too(trainer: Trainer) -> None:
+    target = trainer.renderer.pictures.load(trainer.views[0])
+    weights, mask = torch.tensor([0.0, 4.5, 0.5, 2.0, 0, 0, 0, 9.0, 1.0]), half(48, 48)
+    errors = (drawn(trainer).rgb - target.permute(1, 2, 0) / 255).abs().sum(dim=2) * (1 + 3 * mask)
+    per_tile = errors.detach().view(3, 16, 3, 16).sum(dim=(1, 3)).flatten()
+    found = compared(trainer, target, 0.0, None, weights=weights, moving=Moving(mask, 3.0))
+    expected = float((per_tile * weights).sum() / target.numel())
+    assert found.loss.item() == pytest.approx(expected, rel=1e-4)
+    assert found.tile_errors is not None
+    drawn_tiles = per_tile * (weights > 0)
+    torch.testing.assert_close(found.tile_errors.float(), drawn_tiles, rtol=1e-4, atol=1e-4)
+
+
+def test_if_nothing_moves_nothing_counts_more(trainer: Trainer) -> None:
+    target = trainer.renderer.pictures.load(trainer.views[0])
+    nothing = torch.zeros(target.shape[1:], dtype=torch.bool)
+    for ssim in (0.0, 0.2):
+        plain = compared(trainer, target, ssim, ~nothing)
+        found = compared(trainer, target, ssim, None, moving=Moving(nothing, 3.0))
+        assert found.loss.item() == pytest.approx(plain.loss.item(), rel=1e-6)
 
 
 @pytest.mark.parametrize("engine", ["cpu", "reference"])

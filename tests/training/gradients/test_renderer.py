@@ -17,7 +17,7 @@ from gsdmsr_cli.model.model import STORED_AS, Model
 from gsdmsr_cli.raster import best_engine
 from gsdmsr_cli.scene.camera import Camera
 from gsdmsr_cli.scene.pictures import HalvedPictures, Pictures
-from gsdmsr_cli.scene.scene import MASK, View
+from gsdmsr_cli.scene.scene import MASK, MOVING, View
 from gsdmsr_cli.training.gradients.phase import Order, Phase
 from gsdmsr_cli.training.gradients.renderer import TrainingRenderer
 from gsdmsr_cli.training.trainer import Trainer
@@ -67,6 +67,26 @@ def test_training_leaves_out_what_masks_leave_out(
     assert masked.on_screen[left].any()
     assert not masked.on_screen[far_right & (model.splats.log_scales.exp() < 0.05).all(1)].any()
     assert masked.loss < whole.loss
+
+
+@pytest.mark.parametrize("progress", [0.0, 0.9])
+def test_what_moves_by_a_mask_counts_more(
+    tiny_scene: Path, tmp_path: Path, progress: float
+) -> None:
+    """At half the size, with SSIM, and at the full size without; other views count as before."""
+    preset = preset_of("losses.moving_weight=2", "training.low_resolution_until=0.5")
+    trainer = trainer_of(tiny_scene, preset)
+    renderer, model, phase = trainer.renderer, trainer.model, Phase(progress, moving=False)
+    assert renderer.renders_at_once(model), "no view has a mask yet"
+    (plain,) = renderer.gradients(model, [Order(0)], phase)
+    for share, expected in ((48, 3.0), (0, 1.0)):
+        mask = (np.arange(48) < share)[None].repeat(48, axis=0)
+        path = tmp_path / f"{share}.png"
+        write_picture(path, (255 * mask).astype(np.uint8)[..., None])
+        renderer.views = [replace(trainer.views[0], signals={MOVING: path})]
+        assert not renderer.renders_at_once(model)
+        (found,) = renderer.gradients(model, [Order(0)], phase)
+        assert found.loss.item() == pytest.approx(expected * plain.loss.item(), rel=1e-3)
 
 
 def test_half_the_size_counts_where_half_of_the_pixels_do(tmp_path: Path) -> None:
