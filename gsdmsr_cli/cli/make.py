@@ -24,8 +24,8 @@ def make(
         Path | None, typer.Option(metavar="DIR", help="Folder to write; INPUT-made if not given.")
     ] = None,
     budget: Annotated[
-        str, typer.Option(metavar="10m", help="Wall time of training: 90s, 8m, 1.5h.")
-    ] = "10m",
+        str, typer.Option(metavar="9m", help="Wall time of training: 90s, 8m, 1.5h.")
+    ] = "9m",
     preset: Annotated[
         str | None,
         typer.Option(metavar="NAME", help="Preset to start from.", autocompletion=preset_names),

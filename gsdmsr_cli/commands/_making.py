@@ -30,7 +30,7 @@ class Request:
 
     given: Path
     out: Path
-    budget: str = "10m"
+    budget: str = "9m"
     preset: str | None = None
     overrides: tuple[str, ...] = ()
     frames: int = 240

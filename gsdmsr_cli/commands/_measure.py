@@ -28,7 +28,7 @@ OTHER_VIEWS = 20
 
 Scored = Sequence[tuple[View, protocol.Scores]]
 
-_Task = tuple[str, protocol.ViewRenderer, Sequence[View], Mapping[str, Metric | Missing]]
+_Task = tuple[str, protocol.ViewRenderer, Sequence[View], Mapping[str, Metric | Missing] | None]
 """What is scored in one go: a split or background, and the views and metrics wanted of it."""
 
 
@@ -46,7 +46,7 @@ def measure(trained: Trained, request: Request) -> dict[str, Any]:
     _, *others = _backgrounds(trained, request)
     chosen = _views_by_split(trained, request.split)
     work: list[_Task] = [
-        (split, renderer, own, metrics if split == request.split else {})
+        (split, renderer, own, metrics if split == request.split else None)
         for split, own in chosen.items()
     ]
     over = {name: renderer.over(BACKGROUNDS[name]) for name in others}

@@ -56,7 +56,7 @@ def psnr(rendered: Tensor, target: Tensor, where: Tensor | None = None) -> float
     """
     _check_shapes(rendered, target)
     squares = (rendered.detach().double() - target.detach().double()).square()
-    error = _mean(squares.mean(dim=2), where)
+    error = mean_of(squares.mean(dim=2), where)
     return -10.0 * math.log10(error) if error != 0.0 else math.inf
 
 
@@ -96,10 +96,16 @@ def ssim(rendered: Tensor, target: Tensor, where: Tensor | None = None) -> float
     Raises:
         ValueError: the shapes differ or are not (H, W, 3).
     """
+    return mean_of(similarity(rendered, target), where)
+
+
+@torch.inference_mode()
+def similarity(rendered: Tensor, target: Tensor) -> Tensor:
+    """Return what ``ssim`` is the mean of, at every pixel, (H, W); see there."""
     _check_shapes(rendered, target)
     x, y = rendered.permute(2, 0, 1), target.to(rendered).permute(2, 0, 1)
     luminance, contrast = _similarity(x, y, padding=REACH)
-    return _mean((luminance * contrast).mean(dim=0), where)
+    return (luminance * contrast).mean(dim=0)
 
 
 @torch.inference_mode()
@@ -156,7 +162,7 @@ def _blur(maps: Tensor, padding: int) -> Tensor:
     return flat.reshape(*maps.shape[:2], *flat.shape[-2:])
 
 
-def _mean(values: Tensor, where: Tensor | None) -> float:
+def mean_of(values: Tensor, where: Tensor | None) -> float:
     """Return the mean of (H, W) values over the chosen pixels, NaN if there are none."""
     chosen = values if where is None else values[where]
     return float(chosen.mean(dtype=torch.float64))

@@ -13,7 +13,15 @@ from torch import Tensor
 
 from gsdmsr_cli.drawing.splatting import draw
 from gsdmsr_cli.evaluation.catalogue import Metric
-from gsdmsr_cli.evaluation.metrics import PSNR_CAP, Missing, psnr, psnr_fitted, quantize, ssim
+from gsdmsr_cli.evaluation.metrics import (
+    PSNR_CAP,
+    Missing,
+    mean_of,
+    psnr,
+    psnr_fitted,
+    quantize,
+    similarity,
+)
 from gsdmsr_cli.model.joined import own_name
 from gsdmsr_cli.model.model import FURTHER, MOTION, STORED_AS, Model
 from gsdmsr_cli.raster import Engine
@@ -95,18 +103,28 @@ class ViewRenderer:
 def score_views(
     renderer: ViewRenderer,
     views: Iterable[View],
-    metrics: Mapping[str, Metric | Missing],
+    metrics: Mapping[str, Metric | Missing] | None,
     on_progress: Callable[[int], None],
 ) -> list[tuple[View, Scores]]:
     """Return the scores of every view; ``on_progress`` is called with how many are done.
+
+    Args:
+        renderer: draws them.
+        views: to be scored.
+        metrics: as for ``score``; with None there is nothing but PSNR.
+        on_progress: see above.
 
     Raises:
         DataError: a picture cannot be read.
     """
     scored = []
     for done, view in enumerate(views, start=1):
-        drawn, true, parts = renderer.draw(view), renderer.true(view), renderer.parts(view)
-        scored.append((view, score(drawn, true, metrics, parts)))
+        drawn, true = renderer.draw(view), renderer.true(view)
+        if metrics is None:
+            scores: Scores = {"psnr": _finite(psnr(quantize(drawn), true))}
+        else:
+            scores = score(drawn, true, metrics, renderer.parts(view))
+        scored.append((view, scores))
         on_progress(done)
     return scored
 
@@ -127,18 +145,19 @@ def score(
             pixel are left out.
     """
     rounded = quantize(drawn)
+    similar = similarity(rounded, true)
     values: dict[str, float] = {
         "psnr": psnr(rounded, true),
         "psnr_float": psnr(drawn.clamp(0, 1), true),
         "psnr_fitted": psnr_fitted(rounded, true),
-        "ssim": ssim(rounded, true),
+        "ssim": mean_of(similar, None),
     }
     for name, metric in metrics.items():
         values[name] = math.nan if isinstance(metric, Missing) else metric(rounded, true)
     for part, where in (parts or {}).items():
         if where.any():
             values[f"psnr_{part}"] = psnr(rounded, true, where)
-            values[f"ssim_{part}"] = ssim(rounded, true, where)
+            values[f"ssim_{part}"] = mean_of(similar, where)
     return {name: _finite(value) for name, value in values.items()}
 
 
