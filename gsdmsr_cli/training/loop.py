@@ -193,7 +193,9 @@ def _goes_on(trainer: Trainer, wanted: threading.Event) -> bool:
     """Return whether there is another step to make; the end that any rank wants is wanted."""
     if trainer.meet(wanted.is_set()):
         wanted.set()
-    return trainer.clock.progress < 1 and not wanted.is_set()
+        return False
+    # A signal may have come since, of which the others do not know: they make the step.
+    return trainer.clock.progress < 1
 
 
 def validation_view(scene: Scene) -> View:

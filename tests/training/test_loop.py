@@ -10,6 +10,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -30,7 +31,7 @@ from gsdmsr_cli.runs import checkpoints, log
 from gsdmsr_cli.runs.checkpoints import Checkpoint
 from gsdmsr_cli.runs.run import Run
 from gsdmsr_cli.training import keeping, loop
-from gsdmsr_cli.training.loop import Report, train, validation_view
+from gsdmsr_cli.training.loop import Report, _goes_on, train, validation_view
 from gsdmsr_cli.training.trainer import Step, Trainer
 
 
@@ -372,3 +373,17 @@ def test_time_left_follows_from_the_pace() -> None:
     assert report.remaining == pytest.approx(90.0)
     assert math.isfinite(replace(report, progress=0.0).remaining)
     assert replace(report, progress=1.0).remaining == 0
+
+
+def test_a_signal_of_which_other_ranks_do_not_know_yet_ends_no_step() -> None:
+    """It comes while they meet, after this one has said that it wants no end."""
+    wanted, said = threading.Event(), list[bool]()
+
+    def meet(end_wanted: bool) -> bool:
+        said.append(end_wanted)
+        wanted.set()
+        return end_wanted
+
+    trainer: Any = SimpleNamespace(meet=meet, clock=SimpleNamespace(progress=0.5))
+    assert [_goes_on(trainer, wanted) for _ in "12"] == [True, False]
+    assert said == [False, True]
