@@ -165,6 +165,9 @@ class _Cache(FunctionCache):  # type: ignore[misc]
 
     def load_overload(self, signature: Any, target: Any) -> Any:
         """Return the compiled kernel, or None where this process has to compile it itself."""
+        # Numba starts its threads before it loads a parallel kernel, but not before a serial one
+        # that calls such, which would then call what is not there
+        numba.get_num_threads()
         found = super().load_overload(signature, target)
         if found is not None or not self._can_be_imported():
             return found

@@ -9,6 +9,7 @@ import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -46,14 +47,13 @@ print(json.dumps([[sum(s.cache_hits.values()), sum(s.cache_misses.values())] for
 """
 
 
-def compiled_in(cache: Path, code: str = IN_A_NEW_PROCESS) -> list[list[int]]:
-    """Return how often a new process has found each of two kernels in the cache, and missed it."""
+def compiled_in(cache: Path, code: str = IN_A_NEW_PROCESS) -> Any:
+    """Return what a new process prints: how often it has found two kernels in the cache or not."""
     named = dict(os.environ, NUMBA_CACHE_DIR=str(cache))
     done = subprocess.run(
         [sys.executable, "-c", code], env=named, check=True, capture_output=True, text=True
     )
-    found: list[list[int]] = json.loads(done.stdout)
-    return found
+    return json.loads(done.stdout)
 
 
 def test_a_process_compiles_nothing_itself(tmp_path: Path) -> None:
@@ -61,6 +61,21 @@ def test_a_process_compiles_nothing_itself(tmp_path: Path) -> None:
     assert [compiled_in(tmp_path) for _ in "12"] == [[[1, 0], [0, 0]]] * 2
     assert len(list(tmp_path.rglob("*.depth_order-*.nbc"))) == 1
     assert len(list(tmp_path.rglob("*._sorted_rows-*.nbc"))) == 1
+
+
+SERIAL_FIRST = """
+import json
+import numpy as np
+from gsdmsr_cli.ops.photometric import cpu
+
+drawn, target = np.ones((3, 16, 16), np.float32), np.zeros((3, 16, 16), np.uint8)
+print(json.dumps(cpu.compare(drawn, target, 16, 16, 0.0, 0.0, np.empty_like(drawn))))
+"""
+
+
+def test_a_serial_kernel_may_be_the_first_that_calls_a_parallel_one(tmp_path: Path) -> None:
+    """Whose threads nobody has started yet."""
+    assert compiled_in(tmp_path, SERIAL_FIRST) == 1.0
 
 
 def test_of_two_processes_with_an_empty_cache_one_waits_for_the_other(tmp_path: Path) -> None:
