@@ -29,16 +29,21 @@ OPAQUE = 0.1
 LEAST_SPACING = 1e-3
 """Least initial radius of a control point, in units of the bound."""
 
+_INSTANTS = 8
+"""Times, evenly spaced, at which it is looked where splats go."""
 
-def require_points(options: object, count: int, neighbours: int) -> None:
-    """Check how many control points there are, and how many a splat follows.
+
+def require_points(options: object, count: int, neighbours: int, gather: float) -> None:
+    """Check how many control points there are, how many a splat follows, and where they are.
 
     Raises:
-        InvalidError: there are too few of either, or a splat follows more than there are.
+        InvalidError: there are too few of either, a splat follows more than there are, or
+            ``gather`` is below 1.
     """
     strict.require(options, "count", count > spread.SPACING_OF, "4 or more")
     within = 1 <= neighbours <= count
     strict.require(options, "neighbours", within, f"1 to count, which is {count}")
+    strict.require(options, "gather", gather >= 1, "1 or more")
 
 
 class ControlPoints(Layer):
@@ -47,13 +52,14 @@ class ControlPoints(Layer):
     Args:
         count: number of control points.
         neighbours: how many of them each splat follows.
+        gather: how many times nearer to each other points are placed where splats move.
         facts, generator: see ``start_layer``.
     """
 
     def __init__(
-        self, count: int, neighbours: int, facts: Facts, generator: torch.Generator
+        self, count: int, neighbours: int, gather: float, facts: Facts, generator: torch.Generator
     ) -> None:
-        self.facts, self._kept = facts, neighbours
+        self.facts, self._kept, self._gather = facts, neighbours, gather
         lower, upper = torch.tensor(facts.box)
         anywhere = torch.rand(count, 3, generator=generator)
         self.control_points = spread.spread_out(lower + (upper - lower) * anywhere, count)
@@ -135,21 +141,38 @@ class ControlPoints(Layer):
         return Following(self.control_points, self.log_radii, self._kept, movement)
 
     def reanchor(self, splats: Splats) -> Sequence[str]:
-        """Spread the control points evenly over the present splats that are not transparent.
+        """Spread the control points over the present splats that are not transparent.
 
-        What moves them keeps its values, so the motion of splats hardly changes.
+        Evenly, unless there are more where splats move. What moves the points keeps its values, so
+        the motion of splats hardly changes.
         """
         finite = splats.means.isfinite().all(dim=1)
         opaque = finite & (torch.sigmoid(splats.logit_opacities) >= OPAQUE)
         enough = int(opaque.sum()) >= len(self.control_points)
-        places = splats.means[opaque if enough else finite]
-        if not len(places):
+        rows = (opaque if enough else finite).nonzero()[:, 0]
+        if not len(rows):
             return ()
-        points = spread.spread_out(places, len(self.control_points))
+        weights = None if self._gather == 1 else self._weights(splats.take(rows))
+        points = spread.spread_out(splats.means[rows], len(self.control_points), weights)
         self.control_points.copy_(points)
         self.log_radii.copy_(self._initial_log_radii(points))
         self._found_for = None
         return _POINTS, _LOG_RADII
+
+    @torch.no_grad()
+    def _weights(self, splats: Splats) -> Tensor:
+        """Return how densely control points are to lie at splats, from 1 to ``gather``, (N,).
+
+        As densely as can be where a splat goes farther from its mean place than points that are
+        spread evenly lie apart, and the less the less far it goes.
+        """
+        moment, spans = Moment(splats), (i / (_INSTANTS - 1) for i in range(_INSTANTS))
+        ways = torch.stack([self.at(moment, Instant(t)).splats.means for t in spans])
+        farthest = (ways - ways.mean(dim=0)).norm(dim=2).amax(dim=0)
+        even = spread.spacing(spread.spread_out(splats.means, len(self.control_points)))
+        apart = even.square().mean().sqrt().clamp(min=LEAST_SPACING * self.facts.bound)
+        shares: Tensor = (farthest / apart.to(farthest)).clamp(max=1)
+        return 1 + (self._gather - 1) * shares
 
     def take(self, rows: Tensor, fresh: Tensor) -> None:
         """Drop the neighbours that were found; no parameter has a row per splat."""

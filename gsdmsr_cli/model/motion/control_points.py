@@ -37,6 +37,7 @@ class Options:
     Attributes:
         count: number of control points, 4 or more.
         neighbours: how many of them each splat follows, at most ``count``.
+        gather: how many times nearer to each other points are placed where splats move, 1 or more.
         levels: resolution of each of the grid's 1 to 8 levels along a spatial axis.
         channels: features per level, a multiple of 16.
         time_ratio: the grid's resolution in time per distinct train time.
@@ -51,6 +52,7 @@ class Options:
 
     count: int = 1024
     neighbours: int = 8
+    gather: float = 1.0
     levels: tuple[int, ...] = (16, 32)
     channels: int = 16
     time_ratio: float = 0.2
@@ -63,7 +65,7 @@ class Options:
     rigidity_until: float = 0.0
 
     def __post_init__(self) -> None:
-        require_points(self, self.count, self.neighbours)
+        require_points(self, self.count, self.neighbours, self.gather)
         require_levels(self, "levels")
         require_multiples(self, "channels", "width")
         require(self, "time_ends", 0 < self.time_ends <= 1, "above 0, at most 1")
@@ -76,7 +78,7 @@ class ControlPointMotion(ControlPoints):
     constants = ()
 
     def __init__(self, options: Options, facts: Facts, generator: torch.Generator) -> None:
-        super().__init__(options.count, options.neighbours, facts, generator)
+        super().__init__(options.count, options.neighbours, options.gather, facts, generator)
         self.options = options
         self._rigidity = options.rigidity
         times = time_nodes(facts.frames, options.time_ratio)

@@ -35,6 +35,7 @@ class Options:
     Attributes:
         count: number of control points, 4 or more.
         neighbours: how many of them each splat follows, at most ``count``.
+        gather: how many times nearer to each other points are placed where splats move, 1 or more.
         alone_until: progress up to which every splat is a control point by itself.
         width: width of the hidden layers, a multiple of 16; 256 in the paper.
         depth: number of hidden layers, 2 to 16.
@@ -45,6 +46,7 @@ class Options:
 
     count: int = 512
     neighbours: int = 3
+    gather: float = 1.0
     alone_until: float = 0.1
     width: int = 64
     depth: int = 8
@@ -53,7 +55,7 @@ class Options:
     arap: tuple[float, float] = (1e-2, 1e-4)
 
     def __post_init__(self) -> None:
-        require_points(self, self.count, self.neighbours)
+        require_points(self, self.count, self.neighbours, self.gather)
         require_progress(self, "alone_until")
         require_multiples(self, "width")
         require(self, "depth", 2 <= self.depth <= 16, "2 to 16")
@@ -71,7 +73,7 @@ class NetworkControlPoints(ControlPoints):
     """
 
     def __init__(self, options: Options, facts: Facts, generator: torch.Generator) -> None:
-        super().__init__(options.count, options.neighbours, facts, generator)
+        super().__init__(options.count, options.neighbours, options.gather, facts, generator)
         self.options, self.progress = options, 0.0
         sizes = options.width, options.depth, options.position_octaves, options.time_octaves
         self.network = new_encoded_network(Shape(*sizes), generator)

@@ -25,7 +25,7 @@ _STRETCHES = (
 """By how much to shift and what to keep, to make room for two bits between any two of 21."""
 
 
-def spread_out(points: Tensor, count: int) -> Tensor:
+def spread_out(points: Tensor, count: int, weights: Tensor | None = None) -> Tensor:
     """Return ``count`` of the points (N, 3) that are far from each other, on the CPU.
 
     Some repeatedly if there are fewer. Points are looked at on their device; what comes to the CPU
@@ -36,11 +36,16 @@ def spread_out(points: Tensor, count: int) -> Tensor:
     Args:
         points: finite, N at least 1.
         count: 1 or more.
+        weights: (N,) above 0, by what each one's distance from those chosen is multiplied: points
+            of twice the weight are chosen half as far from each other. None is 1 for all.
     """
     rows = _candidates(points.detach(), CANDIDATES * count)
     given = points.detach()[rows].cpu().double().contiguous()
+    squares = torch.ones(len(rows), dtype=torch.float64)
+    if weights is not None:
+        squares = weights.detach()[rows].cpu().double().square()
     chosen = torch.empty(count, dtype=torch.int64)
-    kernels.choose_spread(array(given), int(rows.argmin()), array(chosen))
+    kernels.choose_spread(array(given), array(squares), int(rows.argmin()), array(chosen))
     found = given[chosen]
     return found[torch.from_numpy(near_order(array(found)))].float()
 

@@ -17,18 +17,18 @@ def _outside(x, low, high):
 
 
 @inline
-def _shorten(points, away, low, high, x, y, z):
+def _shorten(points, squares, away, low, high, x, y, z):
     """Let points know of a chosen one at (x, y, z); return the longest distance that is left."""
     longest = 0.0
     for i in range(low, high):
         a, b, c = points[i, 0] - x, points[i, 1] - y, points[i, 2] - z
-        away[i] = min(away[i], a * a + b * b + c * c)
+        away[i] = min(away[i], squares[i] * (a * a + b * b + c * c))
         longest = max(longest, away[i])
     return longest
 
 
 @serial
-def choose_spread(points, first, rows):
+def choose_spread(points, squares, first, rows):
     """Write the rows of points that are far from each other.
 
     Each is the farthest from those before it, of equally far ones the first. What it costs is far
@@ -38,6 +38,8 @@ def choose_spread(points, first, rows):
     Args:
         points: (N, 3) float64, finite, N at least 1; it is quick where points that follow each
             other lie near each other.
+        squares: (N,) float64, by what the square of each one's distance is multiplied, above 0:
+            points are chosen the nearer to each other the more it is.
         first: which point to begin with.
         rows: (M,) int64, out; rows repeat where there are fewer places than M.
     """
@@ -45,7 +47,9 @@ def choose_spread(points, first, rows):
     buckets = (n + _BUCKET - 1) // _BUCKET
     away, longest = np.full(n, np.inf), np.full(buckets, np.inf)
     lower, upper = np.full((buckets, 3), np.inf), np.full((buckets, 3), -np.inf)
+    least = np.full(buckets, np.inf)
     for i in range(n):
+        least[i // _BUCKET] = min(least[i // _BUCKET], squares[i])
         for axis in range(3):
             lower[i // _BUCKET, axis] = min(lower[i // _BUCKET, axis], points[i, axis])
             upper[i // _BUCKET, axis] = max(upper[i // _BUCKET, axis], points[i, axis])
@@ -57,9 +61,9 @@ def choose_spread(points, first, rows):
             a = _outside(x, lower[b, 0], upper[b, 0])
             c = _outside(y, lower[b, 1], upper[b, 1])
             d = _outside(z, lower[b, 2], upper[b, 2])
-            if a * a + c * c + d * d < longest[b]:
+            if least[b] * (a * a + c * c + d * d) < longest[b]:
                 last = min(n, (b + 1) * _BUCKET)
-                longest[b] = _shorten(points, away, b * _BUCKET, last, x, y, z)
+                longest[b] = _shorten(points, squares, away, b * _BUCKET, last, x, y, z)
             if longest[b] > longest[farthest]:
                 farthest = b
         chosen = farthest * _BUCKET

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import cache
 
 import pytest
@@ -32,8 +32,10 @@ from gsdmsr_cli.ground import plugins
 from gsdmsr_cli.ground.errors import UsageError
 from gsdmsr_cli.model import motion as motions
 from gsdmsr_cli.model.layer import Facts, Instant, Layer, options_of
+from gsdmsr_cli.model.motion._control_points import ControlPoints
 from gsdmsr_cli.model.motion._decoder_smoothness import ROWS
 from gsdmsr_cli.ops import hash_grid
+from gsdmsr_cli.ops.displace import OUTPUTS
 from gsdmsr_cli.ops.hash_grid import lookup_twin as lookup_hashed_twin
 from gsdmsr_cli.ops.planes import CUBE, Level, lookup_twin, penalty_twin
 from gsdmsr_cli.training.rates import NAMED
@@ -628,6 +630,45 @@ def test_radii_of_control_points_are_how_far_apart_they_are() -> None:
     torch.testing.assert_close(log_radii.exp(), torch.full((30,), 1e-3 * FACTS.bound))
 
 
+class HalfMoves(ControlPoints):
+    """Control points of which those of x below 0 go far, 50 times by what the others go."""
+
+    def _deformations(self, points: Tensor, times: Sequence[float]) -> Tensor:
+        way = torch.where(points[:, 0] < 0, 0.5, 0.01)
+        found = torch.zeros(len(times), len(points), OUTPUTS)
+        found[..., 0] = torch.tensor(times)[:, None] * way
+        return found
+
+
+@pytest.mark.parametrize(("gather", "least", "most"), [(1.0, 0.9, 1.1), (2.0, 1.5, 2.2)])
+@torch.no_grad()
+def test_control_points_lie_nearer_to_each_other_where_splats_move(
+    gather: float, least: float, most: float
+) -> None:
+    splats = splats_of(6000)
+    splats.logit_opacities.fill_(1.0)
+    splats.means[:, 2] = 0.0
+    motion = HalfMoves(300, 4, gather, FACTS, generator())
+    motion.reanchor(splats)
+    points, log_radii = (motion.tensors()[name] for name in ("control_points", "log_radii"))
+    assert are_among(points, splats.means)
+    goes = points[:, 0] < 0
+    denser = (log_radii[~goes].mean() - log_radii[goes].mean()).exp()
+    assert least < float(denser) < most
+    assert (int(goes.sum()) > 200) == (gather > 1)
+
+
+@torch.no_grad()
+def test_control_points_lie_evenly_where_nothing_moves_yet() -> None:
+    splats = splats_of(2000)
+    placed = []
+    for gather in (1.0, 4.0):
+        motion = control_points_of(2000, count=100, gather=gather)
+        motion.reanchor(splats)
+        placed.append(motion.tensors()["control_points"].clone())
+    assert torch.equal(*placed)
+
+
 def test_control_points_are_anchored_where_splats_are_if_too_few_of_them_show() -> None:
     splats, motion = splats_of(20), control_points_of(20, count=30)
     splats.logit_opacities.fill_(-9.0)
@@ -676,6 +717,7 @@ def test_control_points_follow_splats_that_have_changed_in_place() -> None:
     [
         ({"count": 3}, "count is 3; allowed: 4 or more"),
         ({"neighbours": 2000}, "1 to count"),
+        ({"gather": 0.5}, "gather is 0.5; allowed: 1 or more"),
         ({"time_ends": 0.0}, "time_ends is 0.0; allowed: above 0, at most 1"),
         ({"time_ends": 1.5}, "time_ends is 1.5; allowed: above 0, at most 1"),
         ({"rigidity_until": 1.5}, "rigidity_until is 1.5; allowed: a progress from 0 to 1"),

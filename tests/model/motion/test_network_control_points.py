@@ -99,6 +99,7 @@ def test_it_trains_in_both_stages_with_workers_without_and_resumed(
     [
         ({"count": 3}, "count is 3; allowed: 4 or more"),
         ({"neighbours": 0}, "neighbours is 0; allowed: 1 to count, which is 512"),
+        ({"gather": 0.0}, "gather is 0.0; allowed: 1 or more"),
         ({"alone_until": 1.5}, "alone_until is 1.5; allowed: a progress from 0 to 1"),
         ({"width": 24}, "width is 24; allowed: a multiple of 16"),
         ({"depth": 1}, "depth is 1; allowed: 2 to 16"),

@@ -88,3 +88,16 @@ def test_fewer_points_than_wanted_are_taken_repeatedly(size: int) -> None:
 
 def test_points_at_one_place_are_spread() -> None:
     assert spread_out(torch.ones(40, 3), 5).tolist() == [[1.0, 1.0, 1.0]] * 5
+
+
+def test_points_of_more_weight_lie_nearer_to_each_other() -> None:
+    """On a line one half of which weighs 4: there points are a quarter as far apart."""
+    points = torch.zeros(4001, 3)
+    points[:, 0] = torch.linspace(-1, 1, 4001)
+    weights = torch.where(points[:, 0] < 0, 4.0, 1.0)
+    chosen = spread_out(points, 41, weights)[:, 0].sort().values
+    gaps = chosen.diff()
+    near, far = gaps[chosen[1:] < 0], gaps[chosen[:-1] >= 0]
+    assert float(near.mean() / far.mean()) == pytest.approx(0.25, abs=0.05)
+    even = spread_out(points, 41, torch.full_like(weights, 4.0))
+    assert torch.equal(even, spread_out(points, 41))
