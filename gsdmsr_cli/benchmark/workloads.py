@@ -12,6 +12,7 @@ from torch import Tensor
 from gsdmsr_cli.benchmark.cloud import camera, cloud
 from gsdmsr_cli.drawing.splatting import draw
 from gsdmsr_cli.gaussians.moment import Moment
+from gsdmsr_cli.ground.measure import Measure
 from gsdmsr_cli.model.building import start_model
 from gsdmsr_cli.model.layer import Facts
 from gsdmsr_cli.model.motion.control_points import Options
@@ -25,7 +26,7 @@ from gsdmsr_cli.training.optimizer import Adam
 
 TIME = 0.65
 FRAMES = 200
-SSIM_WEIGHT = 0.2
+COMPARED = Measure(0.2)
 NOISE = 0.05
 MOVE, MOVES = 1e-4, 16
 """By how much splats and control points go along each axis in a step, and after how many again."""
@@ -80,7 +81,7 @@ def training_step(size: int, count: int, motion: str, device: str = "cpu") -> Ca
     def run() -> None:
         instant = model.instant(TIME, view)
         moment = model.at(instant)
-        found = compare(engine, model, moment, instant, view, background, target, SSIM_WEIGHT)
+        found = compare(engine, model, moment, instant, view, background, target, COMPARED)
         for tensor, gradient in zip(model.trained().values(), found.gradients, strict=True):
             tensor.grad = gradient
         optimizer.step(model.trained(), rates)

@@ -191,6 +191,9 @@ class LossOptions:
     Attributes:
         ssim: weight w of (1 - w) L1 + w (1 - SSIM), 0 to 1.
         ssim_until: progress up to which the SSIM term counts; later w is 0.
+        quadratic: differences of colours up to which they count by their squares, see ``Measure``;
+            0 is L1.
+        quadratic_from: progress from which they do.
         inliers: share of a picture's pixels whose errors are taken to be normal; areas with larger
             ones are left out, such as people who walk by; 1 leaves out nothing.
         moving_weight: by how much more those pixels count of which a view's mask says that they
@@ -201,6 +204,8 @@ class LossOptions:
 
     ssim: float = 0.2
     ssim_until: float = 0.3
+    quadratic: float = 0.0
+    quadratic_from: float = 0.5
     inliers: float = 1.0
     moving_weight: float = 0.0
     terms: tuple[dict[str, Any], ...] = ()
@@ -209,9 +214,9 @@ class LossOptions:
         named = all(isinstance(entry.get("name"), str) for entry in self.terms)
         require(self, "terms", named, "a list of mappings, each with the name of a term")
         require(self, "ssim", 0.0 <= self.ssim <= 1.0, "a weight from 0 to 1")
-        require_progress(self, "ssim_until")
+        require_progress(self, "ssim_until", "quadratic_from")
         require(self, "inliers", 0.0 < self.inliers <= 1.0, "a share above 0, up to 1")
-        require_at_least(self, 0, "moving_weight")
+        require_at_least(self, 0, "quadratic", "moving_weight")
 
 
 @dataclass(frozen=True)

@@ -12,16 +12,16 @@ An engine is a module of this package with two functions::
 and, if it can do both in one go faster than one after the other::
 
     def compare(moment: Moment, camera: Camera, background: Tensor, target: Tensor,
-                ssim_weight: float, sh_degree: int | None = None,
+                measure: Measure, sh_degree: int | None = None,
                 tile_weights: Tensor | None = None) -> Comparison
-        # what ``ops.photometric.photometric_loss`` says of the drawn picture; with ssim_weight 0
+        # what ``ops.photometric.photometric_loss`` says of the drawn picture; without SSIM
         # also of some tiles of it, whose shares of the loss are multiplied by their weights;
         # ValueError if the moment has features, which are decoded before anything is compared
 
 or the same of several views at once::
 
     def compare_views(moments: Sequence[Moment], cameras: Sequence[Camera], background: Tensor,
-                      targets: Sequence[Tensor], ssim_weight: float, sh_degree: int | None = None,
+                      targets: Sequence[Tensor], measure: Measure, sh_degree: int | None = None,
                       tile_weights: Sequence[Tensor] | None = None,
                       ) -> tuple[Tensor, list[Comparison]]
         # the sum of the losses, and what is to be said of each view; all have one picture size
@@ -43,6 +43,7 @@ from gsdmsr_cli.gaussians.frame import Frame
 from gsdmsr_cli.gaussians.moment import Moment
 from gsdmsr_cli.ground import plugins
 from gsdmsr_cli.ground.errors import DataError, UsageError
+from gsdmsr_cli.ground.measure import Measure
 from gsdmsr_cli.scene.camera import Camera
 
 FASTEST_FIRST = ("cuda", "cpu", "reference")
@@ -55,8 +56,8 @@ class Comparison(NamedTuple):
         loss: of the picture.
         on_screen: (N, 2) gradient of the loss by the positions on the screen [1 / px], as if all
             tiles with a weight above 0 had the weight 1.
-        errors: (tiles,) float64, the sum of absolute differences in each tile, 0 where it has the
-            weight 0; None where SSIM counts.
+        errors: (tiles,) float64, the sum of distances in each tile, 0 where it has the weight
+            0; None where SSIM counts.
     """
 
     loss: Tensor
@@ -91,7 +92,7 @@ class Comparing(Engine, Protocol):
         camera: Camera,
         background: Tensor,
         target: Tensor,
-        ssim_weight: float,
+        measure: Measure,
         sh_degree: int | None = None,
         tile_weights: Tensor | None = None,
     ) -> Comparison:
@@ -108,7 +109,7 @@ class ComparingViews(Engine, Protocol):
         cameras: Sequence[Camera],
         background: Tensor,
         targets: Sequence[Tensor],
-        ssim_weight: float,
+        measure: Measure,
         sh_degree: int | None = None,
         tile_weights: Sequence[Tensor] | None = None,
     ) -> tuple[Tensor, list[Comparison]]:

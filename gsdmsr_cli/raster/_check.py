@@ -13,8 +13,9 @@ from gsdmsr_cli.gaussians.frame import Frame
 from gsdmsr_cli.gaussians.moment import Moment
 from gsdmsr_cli.gaussians.splats import NAMES, Splats
 from gsdmsr_cli.ground.errors import GsdmsrError
+from gsdmsr_cli.ground.measure import Measure
 from gsdmsr_cli.ground.splatting_constants import TILE, tile_grid
-from gsdmsr_cli.ops.photometric.twin import ssim
+from gsdmsr_cli.ops.photometric.twin import distances, ssim
 from gsdmsr_cli.raster import Comparison, reference
 from gsdmsr_cli.scene.camera import Camera, look_at
 
@@ -25,8 +26,13 @@ above rounding: single pixels may jump where alpha is next to its cut-off."""
 _COUNT, _WIDTH, _HEIGHT = 60, 52, 37
 _BACKGROUND = torch.tensor([0.2, 0.5, 0.9])
 
-_LOSSES = {"loss": (0.0, False), "SSIM loss": (0.2, False), "loss of weighted tiles": (0.0, True)}
-"""By name the weight of SSIM, and whether tiles are weighted."""
+_LOSSES = {
+    "loss": (Measure(0.0), False),
+    "SSIM loss": (Measure(0.2), False),
+    "loss of squares": (Measure(0.0, 0.3), False),
+    "loss of weighted tiles": (Measure(0.0), True),
+}
+"""By name how pictures are compared, and whether tiles are weighted."""
 
 
 def disagreement(
@@ -76,7 +82,7 @@ def _compared(
     compare: Callable[..., Comparison],
     device: str,
     dtype: torch.dtype,
-    ssim_weight: float,
+    measure: Measure,
     weighted: bool,
 ) -> list[Tensor]:
     """Return the loss against a target, and its gradients."""
@@ -85,7 +91,7 @@ def _compared(
     rows, columns = tile_grid(_WIDTH, _HEIGHT)
     weights = (torch.arange(rows * columns) % 3).to(device, dtype) if weighted else None
     background = _BACKGROUND.to(device, dtype)
-    given = Moment(splats), _camera(), background, target, ssim_weight, None, weights
+    given = Moment(splats), _camera(), background, target, measure, None, weights
     loss = compare(*given).loss
     return [loss.detach(), *torch.autograd.grad(loss, [*splats.tensors().values()])]
 
@@ -95,19 +101,19 @@ def _compare_exactly(
     camera: Camera,
     background: Tensor,
     target: Tensor,
-    ssim_weight: float,
+    measure: Measure,
     _sh_degree: None,
     tile_weights: Tensor | None,
 ) -> Comparison:
     """Compare as the reference would."""
     drawn = reference.rasterize(moment, camera, background).rgb.permute(2, 0, 1)
     wanted = target.to(drawn.dtype) / 255
-    distances = (drawn - wanted).abs()
+    apart = distances(drawn - wanted, measure.quadratic)
     if tile_weights is not None:
         by_tile = tile_weights.view(tile_grid(camera.width, camera.height))
         by_pixel = by_tile.repeat_interleave(TILE, 0).repeat_interleave(TILE, 1)
-        distances = distances * by_pixel[: camera.height, : camera.width]
-    loss = (1 - ssim_weight) * distances.mean() + ssim_weight * (1 - ssim(drawn, wanted))
+        apart = apart * by_pixel[: camera.height, : camera.width]
+    loss = (1 - measure.ssim) * apart.mean() + measure.ssim * (1 - ssim(drawn, wanted))
     return Comparison(loss, torch.empty(0), None)
 
 

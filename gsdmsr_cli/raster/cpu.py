@@ -16,6 +16,7 @@ from gsdmsr_cli.backends.cpu.jit import threads
 from gsdmsr_cli.backends.tensors import array
 from gsdmsr_cli.gaussians.frame import Frame
 from gsdmsr_cli.gaussians.moment import Moment
+from gsdmsr_cli.ground.measure import Measure
 from gsdmsr_cli.ground.splatting_constants import TILE, tile_grid
 from gsdmsr_cli.ops.rasterize.cpu import binning, blending, harmonics, projection
 from gsdmsr_cli.ops.rasterize.cpu import fused as looking
@@ -74,20 +75,20 @@ def compare(
     camera: Camera,
     background: Tensor,
     target: Tensor,
-    ssim_weight: float,
+    measure: Measure,
     sh_degree: int | None = None,
     tile_weights: Tensor | None = None,
 ) -> Comparison:
     """Draw a float32 moment and compare, in one call; see ``gsdmsr_cli.raster``."""
     refuse_features(moment)
-    if tile_weights is not None and ssim_weight > 0:
+    if tile_weights is not None and measure.ssim > 0:
         raise ValueError("tiles cannot be weighted where SSIM counts, whose windows overlap them")
     degree = moment.splats.degree_up_to(sh_degree)
     weights = torch.empty(0) if tile_weights is None else tile_weights.contiguous()
     loss, on_screen, errors = _Look.apply(
-        camera, degree, background, target, ssim_weight, weights, *stored_of(moment)
+        camera, degree, background, target, measure, weights, *stored_of(moment)
     )
-    return Comparison(loss, on_screen, errors if ssim_weight == 0 else None)
+    return Comparison(loss, on_screen, errors if measure.ssim == 0 else None)
 
 
 def _view(camera: Camera) -> tuple[NDArray[np.float32], NDArray[np.float32], int, int]:
@@ -115,7 +116,7 @@ class _Look(Function):
         degree: int,
         background: Tensor,
         target: Tensor,
-        ssim_weight: float,
+        measure: Measure,
         tile_weights: Tensor,
         means: Tensor,
         *others: Tensor | None,
@@ -129,8 +130,8 @@ class _Look(Function):
         loss = looking.look(
             *_arrays(stored), (degree + 1) ** 2, view, intrinsics,
             camera.centre.astype(np.float32), width, height, array(background.contiguous()),
-            array(target), float(ssim_weight), threads(), array(tile_weights), array(errors),
-            *_arrays(gradients), array(on_screen),
+            array(target), float(measure.ssim), float(measure.quadratic), threads(),
+            array(tile_weights), array(errors), *_arrays(gradients), array(on_screen),
         )  # fmt: skip
         ctx.gradients = gradients
         ctx.mark_non_differentiable(on_screen, errors)

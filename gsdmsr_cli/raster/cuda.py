@@ -15,6 +15,7 @@ from gsdmsr_cli.backends.cuda.availability import missing
 from gsdmsr_cli.gaussians.frame import Frame
 from gsdmsr_cli.gaussians.moment import Moment
 from gsdmsr_cli.gaussians.splats import Splats
+from gsdmsr_cli.ground.measure import Measure
 from gsdmsr_cli.ops.rasterize.cuda import stages
 from gsdmsr_cli.raster import Comparison
 from gsdmsr_cli.raster._check import disagreement
@@ -89,13 +90,13 @@ def compare(
     camera: Camera,
     background: Tensor,
     target: Tensor,
-    ssim_weight: float,
+    measure: Measure,
     sh_degree: int | None = None,
     tile_weights: Tensor | None = None,
 ) -> Comparison:
     """Draw a float32 moment and compare, without waiting for the GPU; see ``gsdmsr_cli.raster``."""
     weights = None if tile_weights is None else [tile_weights]
-    given = [moment], [camera], background, [target], ssim_weight, sh_degree, weights
+    given = [moment], [camera], background, [target], measure, sh_degree, weights
     loss, (view,) = compare_views(*given)
     return view._replace(loss=loss)
 
@@ -105,7 +106,7 @@ def compare_views(
     cameras: Sequence[Camera],
     background: Tensor,
     targets: Sequence[Tensor],
-    ssim_weight: float,
+    measure: Measure,
     sh_degree: int | None = None,
     tile_weights: Sequence[Tensor] | None = None,
 ) -> tuple[Tensor, list[Comparison]]:
@@ -115,7 +116,7 @@ def compare_views(
         moments: of each view, such as one model's at several times; what is the very same tensor
             in all of them is read in place, what differs is copied. All have axes or none has.
         cameras: of each view, all of one picture size.
-        background, ssim_weight, sh_degree: of all views.
+        background, measure, sh_degree: of all views.
         targets, tile_weights: of each view.
 
     Returns:
@@ -126,7 +127,7 @@ def compare_views(
         ValueError: there are no views, more than ``MOST_VIEWS``, or they differ in size; some but
             not all moments have axes; or one has features.
     """
-    if tile_weights is not None and ssim_weight > 0:
+    if tile_weights is not None and measure.ssim > 0:
         raise ValueError("tiles cannot be weighted where SSIM counts, whose windows overlap them")
     for moment in moments:
         refuse_features(moment)
@@ -135,10 +136,10 @@ def compare_views(
     first = moments[0].splats
     loss, losses, on_screen, errors = _Look.apply(
         views, _terms(first, sh_degree), _to(background, first.means),
-        targets, ssim_weight, None if tile_weights is None else torch.cat([*tile_weights]), *stored,
+        targets, measure, None if tile_weights is None else torch.cat([*tile_weights]), *stored,
     )  # fmt: skip
     each = zip(losses, on_screen.view(len(moments), -1, 2), errors, strict=True)
-    return loss, [Comparison(*view[:2], None if ssim_weight > 0 else view[2]) for view in each]
+    return loss, [Comparison(*view[:2], None if measure.ssim > 0 else view[2]) for view in each]
 
 
 def _together(tensors: Sequence[Tensor | None]) -> Tensor | None:
@@ -232,7 +233,7 @@ class _Look(Function):
         terms: int,
         background: Tensor,
         targets: Sequence[Tensor],
-        ssim_weight: float,
+        measure: Measure,
         tile_weights: Tensor | None,
         *tensors: Any,
     ) -> tuple[Tensor, ...]:
@@ -240,14 +241,14 @@ class _Look(Function):
         found = stages.project(views, stored, terms)
         bins = stages.bin_splats(views, found, exact=False)
         projected = found.means2d, found.shapes, found.paints
-        if ssim_weight > 0:
+        if measure.ssim > 0:
             drawn = stages.blend(views, projected, bins, background, with_depth=False)
-            losses, d_rgb = stages.compare(views, drawn[0], targets, ssim_weight)
+            losses, d_rgb = stages.compare(views, drawn[0], targets, measure)
             sums = stages.blend_backward(views, projected, bins, drawn, (d_rgb, None, None))
             errors = losses.new_empty(views.number, 0)
         else:
-            errors, sums = stages.blend_l1(
-                views, projected, bins, background, targets, tile_weights
+            errors, sums = stages.blend_and_compare(
+                views, projected, bins, background, targets, tile_weights, measure.quadratic
             )
             weighted = errors if tile_weights is None else errors * tile_weights.view_as(errors)
             losses = weighted.sum(dim=1) / (3 * views.width * views.height)

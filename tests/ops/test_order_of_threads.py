@@ -18,6 +18,7 @@ from gsdmsr_cli.backends.cuda import compiler, launch
 from gsdmsr_cli.benchmark.cloud import camera, cloud
 from gsdmsr_cli.gaussians.moment import Moment
 from gsdmsr_cli.gaussians.splats import Splats
+from gsdmsr_cli.ground.measure import Measure
 from gsdmsr_cli.ops import hash_grid, planes
 from gsdmsr_cli.ops import skin as skinning
 from gsdmsr_cli.ops.cube_map import show_behind
@@ -76,7 +77,7 @@ def comparing(ssim: float, weighted: bool = False) -> list[Tensor]:
     targets = [torch.randint(256, shape, generator=rng, dtype=torch.uint8) for _ in views]
     weights = [torch.arange(9.0), torch.ones(9)] if weighted else None
     loss, found = cuda.compare_views(
-        [Moment(some)] * 2, views, BACKGROUND, targets, ssim, tile_weights=weights
+        [Moment(some)] * 2, views, BACKGROUND, targets, Measure(ssim), tile_weights=weights
     )
     gradients = torch.autograd.grad(loss, list(some.tensors().values()))
     errors = [view.errors for view in found if view.errors is not None]

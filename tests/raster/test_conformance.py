@@ -25,6 +25,7 @@ from raster_scenes import (
 from torch import Tensor
 
 from gsdmsr_cli.gaussians.moment import Moment
+from gsdmsr_cli.ground.measure import Measure
 from gsdmsr_cli.ground.splatting_constants import ALPHA_MAX, TRANSMITTANCE_STOP, tile_grid
 from gsdmsr_cli.raster import (
     Comparing,
@@ -44,6 +45,7 @@ Placed = tuple[Engine, str]
 
 
 ON_THE_CPU = "cuda, its kernels on the CPU"
+MEASURES = [Measure(0.0), Measure(0.2), Measure(0.0, 0.2)]
 ENGINES = [name for name in engine_names() if name != "reference"] + [ON_THE_CPU]
 
 
@@ -203,7 +205,7 @@ def test_what_was_drawn_carries_gradients_and_radii_do_not(placed: Placed) -> No
 
 def test_features_are_not_compared_in_one_go(placed: Placed) -> None:
     with pytest.raises(ValueError, match="drawn by rasterize and compared afterwards"):
-        compared(placed, "17x33, 1 features", 0.2)
+        compared(placed, "17x33, 1 features", Measure(0.2))
 
 
 def test_values_that_overflow_spoil_neither_picture_nor_gradients(placed: Placed) -> None:
@@ -223,12 +225,12 @@ def test_zero_splats_give_the_background(placed: Placed) -> None:
 
 
 def compared(
-    placed: Placed, name: str, ssim: float, chosen: bool = False
+    placed: Placed, name: str, measure: Measure, chosen: bool = False
 ) -> tuple[list[Tensor], list[Tensor]]:
     """Loss, gradients, screen gradients and tile errors by ``compare``, and by drawing first.
 
     Args:
-        ssim: weight of SSIM.
+        measure: how pictures are compared.
         chosen: weigh the tiles, and leave every third out.
     """
     engine, device = placed
@@ -246,11 +248,11 @@ def compared(
         weights = torch.rand(tiles, generator=rng).to(device) * 3
         weights[::3] = 0
     frame = engine.rasterize(leaves, of.camera, background, of.sh_degree)
-    judged = judge(frame, target, ssim, weights)
+    judged = judge(frame, target, measure, weights)
     (on_screen,) = torch.autograd.grad(judged.unweighted, frame.means2d, retain_graph=True)
     results = []
     for found in (
-        engine.compare(leaves, of.camera, background, target, ssim, of.sh_degree, weights),
+        engine.compare(leaves, of.camera, background, target, measure, of.sh_degree, weights),
         Comparison(judged.loss, on_screen, judged.errors),
     ):
         gradients = torch.autograd.grad(2 * found.loss, tensors)
@@ -259,10 +261,12 @@ def compared(
     return results[0], results[1]
 
 
-@pytest.mark.parametrize("ssim", [0.0, 0.2])
+@pytest.mark.parametrize("measure", MEASURES)
 @pytest.mark.parametrize("name", CASES)
-def test_comparing_is_drawing_and_then_comparing(placed: Placed, name: str, ssim: float) -> None:
-    for found, expected in zip(*compared(placed, name, ssim), strict=True):
+def test_comparing_is_drawing_and_then_comparing(
+    placed: Placed, name: str, measure: Measure
+) -> None:
+    for found, expected in zip(*compared(placed, name, measure), strict=True):
         if placed[0] is load_engine("cuda"):  # which adds up in no fixed order
             assert_nearly_same(found, expected)
         else:
@@ -275,16 +279,17 @@ def assert_nearly_same(found: Tensor, expected: Tensor) -> None:
     assert float(error) <= 0.1 * BACKWARD * float(size) + 1e-9
 
 
+@pytest.mark.parametrize("measure", [Measure(0.0), Measure(0.0, 0.2)])
 @pytest.mark.parametrize("name", CASES)
-def test_tiles_count_by_their_weights(placed: Placed, name: str) -> None:
+def test_tiles_count_by_their_weights(placed: Placed, name: str, measure: Measure) -> None:
     """Weights enter after the sum over a tile or before it; terms that cancel round otherwise."""
-    for found, expected in zip(*compared(placed, name, 0.0, chosen=True), strict=True):
+    for found, expected in zip(*compared(placed, name, measure, chosen=True), strict=True):
         assert_nearly_same(found, expected)
 
 
 def test_tiles_cannot_be_weighted_where_ssim_counts(placed: Placed) -> None:
     with pytest.raises(ValueError, match="SSIM"):
-        compared(placed, "64x48", 0.2, chosen=True)
+        compared(placed, "64x48", Measure(0.2), chosen=True)
 
 
 @pytest.fixture
@@ -310,8 +315,8 @@ def test_result_does_not_depend_on_the_number_of_threads(name: str) -> None:
     for threads in (1, 2):
         numba.set_num_threads(threads)
         drawn.append(draw(engine, case(name), weights, "cpu", torch.float32))
-        losses.append([t for w in (0.0, 0.2) for t in compared((engine, "cpu"), name, w)[0]])
-        losses[-1] += compared((engine, "cpu"), name, 0.0, chosen=True)[0]
+        losses.append([t for m in MEASURES for t in compared((engine, "cpu"), name, m)[0]])
+        losses[-1] += compared((engine, "cpu"), name, Measure(0.0), chosen=True)[0]
     for found, expected in zip(*losses, strict=True):
         assert torch.equal(found, expected)
     one, two = drawn

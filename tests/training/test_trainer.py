@@ -29,6 +29,7 @@ from gsdmsr_cli.gaussians.moment import Moment
 from gsdmsr_cli.gaussians.splats import Splats
 from gsdmsr_cli.ground import plugins
 from gsdmsr_cli.ground.errors import GsdmsrError
+from gsdmsr_cli.ground.measure import Measure
 from gsdmsr_cli.model import motion as motions
 from gsdmsr_cli.raster import best_engine
 from gsdmsr_cli.runs import earlier
@@ -73,6 +74,7 @@ def state_of(trainer: Trainer) -> dict[str, Tensor]:
 @every_motion
 def test_training_lowers_the_loss(tiny_scene: Path, motion: str) -> None:
     options = ["training.steps=80", "splats.count=300", "density.reset_at=[]", "density.cap=400"]
+    options += ["losses.quadratic=0"]  # one loss all the time
     losses = after(trainer_of(tiny_scene, preset_of(*options, motion=motion)), 80)
     assert sum(losses[-12:]) < 0.6 * sum(losses[:12])
 
@@ -373,21 +375,21 @@ def test_pictures_are_small_at_first_where_asked_for(tiny_scene: Path) -> None:
     assert engine.sizes == [(12, 12)] * (STEPS // 2) + [(24, 24)] * (STEPS // 2)
 
 
-def test_ssim_counts_up_to_its_end(tiny_scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    weights, true = [], compare.photometric_loss
+def test_ssim_counts_up_to_its_end_and_squares_from_their_beginning(
+    tiny_scene: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    measures, true = [], compare.photometric_loss
 
-    def remember(rgb: Tensor, target: Tensor, ssim_weight: float) -> Tensor:
-        weights.append(ssim_weight)
-        return true(rgb, target, ssim_weight)
+    def remember(rgb: Tensor, target: Tensor, measure: Measure) -> Tensor:
+        measures.append(measure)
+        return true(rgb, target, measure)
 
     monkeypatch.setattr(compare, "photometric_loss", remember)
-    after(
-        trainer_of(
-            tiny_scene, preset_of("losses.ssim=0.4", "losses.ssim_until=0.25"), RecordingEngine()
-        ),
-        STEPS,
-    )
-    assert weights == [0.4] * (STEPS // 4) + [0.0] * (STEPS - STEPS // 4)
+    options = "losses={ssim: 0.4, ssim_until: 0.25, quadratic: 0.1, quadratic_from: 0.5}"
+    after(trainer_of(tiny_scene, preset_of(options), RecordingEngine()), STEPS)
+    quarter = STEPS // 4
+    then, last = [Measure(0.0)] * quarter, [Measure(0.0, 0.1)] * (STEPS - 2 * quarter)
+    assert measures == [Measure(0.4)] * quarter + then + last
 
 
 def test_higher_degrees_of_colour_join_later(tiny_scene: Path) -> None:

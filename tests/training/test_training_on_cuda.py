@@ -141,7 +141,7 @@ def elsewhere(data: Path, preset: Preset) -> Trainer:
     [
         (("training.static_until=1.0",), "ssim_maps"),
         ((), "space_penalty"),
-        (("losses.ssim=0",), "blend_l1"),
+        (("losses.ssim=0",), "blend_and_compare"),
         (("saliency.gate=scale", "saliency.gate_from=0"), "adam"),
         (("saliency.gate=freeze", "saliency.gate_from=0", "saliency.quantile=0.5"), "adam"),
         (("motion.smooth_weight=0.1",), "lookup_backward"),

@@ -29,8 +29,19 @@ struct Targets {
     const unsigned char *of_view[MOST_VIEWS];
 };
 
-__device__ __forceinline__ float slope_of_distance(float difference, float weight) {
-    return difference > 0.0f ? weight : difference < 0.0f ? -weight : 0.0f;
+__device__ __forceinline__ float slope_of_size(float x, float weight) {
+    return x > 0.0f ? weight : x < 0.0f ? -weight : 0.0f;
+}
+
+// How far colours are apart: Huber's loss over q. steep is 1 / q and half q / 2, or steep so large
+// that any difference is beyond q and half 0, which makes it |difference|.
+__device__ __forceinline__ float distance_of(float difference, float steep, float half) {
+    float apart = fabsf(difference), share = fminf(apart * steep, 1.0f);
+    return share * (apart - share * half);
+}
+
+__device__ __forceinline__ float slope_of_distance(float difference, float weight, float steep) {
+    return fmaxf(fminf(difference * (steep * weight), weight), -weight);
 }
 
 // The sum over the lanes of a warp, in every lane.

@@ -1,4 +1,4 @@
-"""The photometric loss: L1 and structural dissimilarity against an 8-bit target."""
+"""The photometric loss: distance of colours and structural dissimilarity to an 8-bit target."""
 
 from __future__ import annotations
 
@@ -11,40 +11,43 @@ from torch.autograd.function import once_differentiable
 
 from gsdmsr_cli.backends.cpu.simd import LANES
 from gsdmsr_cli.backends.tensors import array
+from gsdmsr_cli.ground.measure import Measure
 from gsdmsr_cli.ground.splatting_constants import TILE, tile_grid
 from gsdmsr_cli.ops.choose import choose
 from gsdmsr_cli.ops.photometric import cpu as kernels
-from gsdmsr_cli.ops.photometric.twin import photometric_loss_twin
+from gsdmsr_cli.ops.photometric.twin import distances, photometric_loss_twin
 
-__all__ = ["photometric_loss", "photometric_loss_twin", "tile_errors"]
+__all__ = ["Measure", "photometric_loss", "photometric_loss_twin", "tile_errors"]
 
 
-def photometric_loss(rgb: Tensor, target: Tensor, ssim_weight: float) -> Tensor:
-    """Return (1 - w) mean |rgb - target| + w (1 - SSIM), as 3DGS does with w = 0.2.
+def photometric_loss(rgb: Tensor, target: Tensor, measure: Measure) -> Tensor:
+    """Return the loss of a picture.
 
     Args:
         rgb: (H, W, 3) drawn picture.
         target: (3, H, W) uint8 picture.
-        ssim_weight: w in [0, 1].
+        measure: what it is made of.
     """
     if choose(rgb) == "cpu":
-        loss: Tensor = _Photometric.apply(rgb, target, ssim_weight)
+        loss: Tensor = _Photometric.apply(rgb, target, measure)
         return loss
-    return photometric_loss_twin(rgb, target, ssim_weight)
+    return photometric_loss_twin(rgb, target, measure)
 
 
-def tile_errors(rgb: Tensor, target: Tensor) -> Tensor:
-    """Return the sum of |rgb - target| in each tile, (tiles,) float64, row by row of tiles.
+def tile_errors(rgb: Tensor, target: Tensor, quadratic: float) -> Tensor:
+    """Return the sum of the distances in each tile, (tiles,) float64, row by row of tiles.
 
     Args:
         rgb: (H, W, 3) drawn picture.
         target: (3, H, W) uint8 picture.
+        quadratic: see ``Measure``.
     """
     height, width, _ = rgb.shape
     rows, columns = tile_grid(width, height)
-    differences = (rgb - target.permute(1, 2, 0).to(rgb.dtype) / 255).abs().sum(dim=2).double()
+    differences = rgb - target.permute(1, 2, 0).to(rgb.dtype) / 255
+    apart = distances(differences, quadratic).sum(dim=2).double()
     right, below = columns * TILE - width, rows * TILE - height
-    whole = torch.nn.functional.pad(differences, (0, right, 0, below))
+    whole = torch.nn.functional.pad(apart, (0, right, 0, below))
     return whole.view(rows, TILE, columns, TILE).sum(dim=(1, 3)).flatten()
 
 
@@ -52,13 +55,14 @@ class _Photometric(Function):
     """Value and gradient in one go: the gradient depends on what follows only by a factor."""
 
     @staticmethod
-    def forward(ctx: Any, rgb: Tensor, target: Tensor, ssim_weight: float) -> Tensor:
+    def forward(ctx: Any, rgb: Tensor, target: Tensor, measure: Measure) -> Tensor:
         height, width, _ = rgb.shape
         planes = _planes(rgb)
         gradient = torch.empty_like(planes)
         loss = kernels.compare(
-            array(planes), array(target), height, width, float(ssim_weight), array(gradient)
-        )
+            array(planes), array(target), height, width, float(measure.ssim),
+            float(measure.quadratic), array(gradient),
+        )  # fmt: skip
         ctx.gradient = gradient[:, :height, :width].permute(1, 2, 0)
         return torch.tensor(loss, dtype=torch.float32)
 

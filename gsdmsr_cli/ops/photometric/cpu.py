@@ -1,4 +1,4 @@
-"""L1 and SSIM of a drawn picture against an 8-bit target, with their gradients.
+"""How far a drawn picture is from an 8-bit target by colours and by SSIM, with the gradients.
 
 SSIM is that of 3DGS: an 11 x 11 Gaussian window of sigma 1.5, zero padding, averaged over pixels
 and channels (Wang et al. 2004). Pictures are planes (3, H', W') whose width is a multiple of 16 and
@@ -13,6 +13,7 @@ from numba import float32, prange
 from gsdmsr_cli.backends.cpu import simd
 from gsdmsr_cli.backends.cpu.jit import inline, parallel, serial
 from gsdmsr_cli.ground import ssim
+from gsdmsr_cli.ground.measure import ALIKE
 
 STRIP = 32
 """Rows that one task handles at a time; its horizontal sums stay in cache."""
@@ -24,6 +25,7 @@ _MARGIN = _LANES
 WINDOW = ssim.WINDOW.astype(np.float32)
 _W0, _W1, _W2, _W3, _W4, _W5 = (float32(w) for w in WINDOW[: _REACH + 1])
 _SCALE = float32(1 / 255)
+_STEEPEST = float32(1e30)
 
 
 @parallel
@@ -43,12 +45,13 @@ def to_float(target, planes):
 
 
 @parallel
-def l1(drawn, target, height, width, weight, gradient, sums):
-    """Write weight * sign(drawn - target), 0 outside the picture, and sums of |differences|.
+def distance(drawn, target, height, width, weight, steep, half, gradient, sums):
+    """Write the sums over rows of how far colours are apart, and weight times their slopes.
 
     Args:
-        drawn, gradient: planes (3, H', W').
+        drawn, gradient: planes (3, H', W'); the gradient is 0 outside the picture.
         target: (3, H, W) uint8.
+        weight, steep, half: see ``distances``.
         sums: (3 * H',) out.
     """
     rows, stride = drawn.shape[1], drawn.shape[2]
@@ -64,9 +67,9 @@ def l1(drawn, target, height, width, weight, gradient, sums):
             at, inside = task * stride + x, width - x
             wanted = load_target(pixels, (channel * height + y) * width + x, inside, row)
             shown = simd.load(flat, at) * simd.first_lanes(inside)
-            distance, slope = distances(shown - wanted, weight)
+            apart, slope = distances(shown - wanted, weight, steep, half)
             simd.store(out, at, slope)
-            total = total + distance
+            total = total + apart
         sums[task] = simd.reduce_sum(total)
 
 
@@ -85,13 +88,27 @@ def load_target(pixels, at, inside, row):
 
 
 @inline
-def distances(differences, weight):
-    """Return |difference| and weight * sign(difference) of every lane."""
-    zero = simd.splat(float32(0))
-    opposite = zero - differences
-    slopes = simd.where_positive(differences, simd.splat(weight))
-    slopes = slopes - simd.where_positive(opposite, simd.splat(weight))
-    return simd.maximum(differences, opposite), slopes
+def bend(quadratic):
+    """Return what ``distances`` takes of a ``Measure``, and what its results are multiplied by."""
+    if quadratic > 0:
+        return float32(1 / quadratic), float32(quadratic / 2), quadratic / ALIKE
+    return _STEEPEST, float32(0), 1.0
+
+
+@inline
+def distances(differences, weight, steep, half):
+    """Return how far colours are apart in every lane, and weight times its slope.
+
+    That is Huber's loss, divided by the q up to which differences count by their squares.
+
+    Args:
+        steep, half: 1 / q and q / 2; so steep that any difference is beyond q, and 0, for |d|.
+    """
+    zero, most = simd.splat(float32(0)), simd.splat(weight)
+    apart = simd.maximum(differences, zero - differences)
+    share = simd.minimum(apart * steep, simd.splat(float32(1)))
+    slopes = simd.maximum(simd.minimum(differences * (steep * weight), most), zero - most)
+    return share * (apart - share * half), slopes
 
 
 @inline
@@ -204,12 +221,14 @@ def ssim_gradient(drawn, target, height, width, maps, weight, gradient):
 
 
 @serial
-def compare(drawn, target, height, width, ssim_weight, gradient):
-    """Return (1 - w) L1 + w (1 - SSIM), and write its gradient; arguments as in ``l1``."""
+def compare(drawn, target, height, width, ssim_weight, quadratic, gradient):
+    """Return the loss of a ``Measure``, and write its gradient; arguments as in ``distance``."""
     count = 3 * height * width
     sums = np.empty(3 * drawn.shape[1])
-    l1(drawn, target, height, width, float32((1 - ssim_weight) / count), gradient, sums)
-    loss = (1 - ssim_weight) * sums.sum() / count
+    steep, half, unit = bend(quadratic)
+    weight = (1 - ssim_weight) * unit / count
+    distance(drawn, target, height, width, float32(weight), steep, half, gradient, sums)
+    loss = weight * sums.sum()
     if ssim_weight > 0:
         wanted = np.empty_like(drawn)
         to_float(target, wanted)

@@ -1,4 +1,4 @@
-// L1 and SSIM of drawn pictures against 8-bit targets, with their gradients.
+// How far drawn pictures are from 8-bit targets by colours and by SSIM, with the gradients.
 //
 // SSIM is that of 3DGS: an 11 x 11 Gaussian window of sigma 1.5, zero padding, averaged over pixels
 // and channels (Wang et al. 2004). A block of threads does one tile of one channel: it reads the tile
@@ -120,12 +120,13 @@ extern "C" __global__ void __launch_bounds__(THREADS) ssim_maps(
     if (threadIdx.x == 0) sums[blockIdx.y * gridDim.x + blockIdx.x] = total;
 }
 
-// Writes l1_weight times the slope of |drawn - target| plus ssim_weight times that of the sum of SSIM.
+// Writes weight times the slope of the distance plus ssim_weight times that of the sum of SSIM.
 //
-// sums (views, 3, tiles) get the sum of absolute differences over each tile.
+// sums (views, 3, tiles) get the sum of distances over each tile.
 extern "C" __global__ void __launch_bounds__(THREADS) photometric_gradient(
     int width, int height, const float *drawn, const __grid_constant__ Targets targets,
-    const float *maps, float l1_weight, float ssim_weight, float *gradient, float *sums
+    const float *maps, float weight, float steep, float half, float ssim_weight, float *gradient,
+    float *sums
 ) {
     __shared__ float wide[WIDE][WIDE];
     __shared__ float blurred[WIDE][TILE];
@@ -153,8 +154,8 @@ extern "C" __global__ void __launch_bounds__(THREADS) photometric_gradient(
         size_t at = (size_t)s.row * width + s.column;
         const unsigned char *target = targets.of_view[s.view] + (size_t)s.channel * height * width;
         float x = drawn[s.plane + at], y = target[at] * (1.0f / 255.0f);
-        distance = fabsf(x - y);
-        gradient[s.plane + at] = slope_of_distance(x - y, l1_weight)
+        distance = distance_of(x - y, steep, half);
+        gradient[s.plane + at] = slope_of_distance(x - y, weight, steep)
             + ssim_weight * (parts[0] + 2 * x * parts[1] + y * parts[2]);
     }
     float total = block_sum(distance, shares);

@@ -5,16 +5,27 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from gsdmsr_cli.ground.measure import ALIKE, Measure
 from gsdmsr_cli.ground.ssim import C1, C2, WINDOW
 
 
-def photometric_loss_twin(rgb: Tensor, target: Tensor, ssim_weight: float) -> Tensor:
+def photometric_loss_twin(rgb: Tensor, target: Tensor, measure: Measure) -> Tensor:
     """Return what ``photometric_loss`` does, in plain torch, for any device and dtype."""
     drawn, wanted = rgb.permute(2, 0, 1), target.to(rgb.dtype) / 255
-    loss = (1 - ssim_weight) * (drawn - wanted).abs().mean()
-    if ssim_weight > 0:
-        loss = loss + ssim_weight * (1 - ssim(drawn, wanted))
+    loss = (1 - measure.ssim) * distances(drawn - wanted, measure.quadratic).mean()
+    if measure.ssim > 0:
+        loss = loss + measure.ssim * (1 - ssim(drawn, wanted))
     return loss
+
+
+def distances(differences: Tensor, quadratic: float) -> Tensor:
+    """Return how far colours are apart of which these are the differences, see ``Measure``."""
+    if quadratic == 0:
+        return differences.abs()
+    zero = torch.zeros((), dtype=differences.dtype, device=differences.device)
+    huber = torch.nn.functional.huber_loss
+    apart = huber(differences, zero.expand_as(differences), reduction="none", delta=quadratic)
+    return apart / ALIKE
 
 
 def ssim(x: Tensor, y: Tensor) -> Tensor:

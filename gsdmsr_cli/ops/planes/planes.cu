@@ -50,7 +50,7 @@ extern "C" __global__ void __launch_bounds__(THREADS) time_penalty(
         if (t > 1) slope += bend_at(time, k - row, row);
         if (t + 2 < times) slope += bend_at(time, k + row, row);
         value += still_weight * fabsf(away);
-        d_time[k] = 2.0f * smooth_weight * slope + slope_of_distance(away, still_weight);
+        d_time[k] = 2.0f * smooth_weight * slope + slope_of_size(away, still_weight);
     }
     value = warp_sum(value);
     if (threadIdx.x % WARP == 0) atomicAdd(total, (double)value);

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from gsdmsr_cli.gaussians.frame import Frame
 from gsdmsr_cli.gaussians.moment import Moment
+from gsdmsr_cli.ground.measure import Measure
 from gsdmsr_cli.ground.ssim import REACH
 from gsdmsr_cli.model.layer import Instant
 from gsdmsr_cli.model.model import Model
@@ -54,7 +55,7 @@ def compare(
     camera: Camera,
     background: Tensor,
     target: Tensor,
-    ssim_weight: float,
+    measure: Measure,
     sh_degree: int | None = None,
     tile_weights: Tensor | None = None,
     counted: Tensor | None = None,
@@ -73,7 +74,7 @@ def compare(
         moment: the model's, at the instant of the target or unmoved.
         instant: of the target.
         camera, background, sh_degree: see ``Engine.rasterize``.
-        target, ssim_weight: see ``photometric_loss``.
+        target, measure: see ``photometric_loss``.
         tile_weights: (tiles,) factors on the share of each tile in the loss, or None for 1
             everywhere; only where SSIM has no weight.
         counted: (H, W) bool, pixels that have a part in the loss, or None for all.
@@ -85,14 +86,12 @@ def compare(
     whole = counted is None and moving is None and normal == 1
     whole = whole and moment.features is None and not model.shades
     if whole and isinstance(engine, Comparing):
-        found = engine.compare(
-            moment, camera, background, target, ssim_weight, sh_degree, tile_weights
-        )
+        found = engine.compare(moment, camera, background, target, measure, sh_degree, tile_weights)
         loss = found.loss if further is None else found.loss + further
         size, gradients = (camera.width, camera.height), gradients_of(loss, model)
         return ViewGradients(loss.detach(), gradients, found.on_screen, size, found.errors)
     frame = model.shade(engine.rasterize(moment, camera, background, sh_degree), instant)
-    judged = judge(frame, target, ssim_weight, tile_weights, counted, normal, moving)
+    judged = judge(frame, target, measure, tile_weights, counted, normal, moving)
     return differentiate(judged, frame, model, screens, further)
 
 
@@ -103,7 +102,7 @@ def compare_views(
     cameras: Sequence[Camera],
     background: Tensor,
     targets: Sequence[Tensor],
-    ssim_weight: float,
+    measure: Measure,
     sh_degree: int | None,
     tile_weights: Sequence[Tensor | None],
     further: Sequence[Tensor | None],
@@ -111,7 +110,7 @@ def compare_views(
     """Do what ``compare`` does of several views at once."""
     weights = [own for own in tile_weights if own is not None]
     loss, found = engine.compare_views(
-        moments, cameras, background, targets, ssim_weight, sh_degree, weights or None
+        moments, cameras, background, targets, measure, sh_degree, weights or None
     )
     more = sum_of(further)
     gradients = gradients_of(loss if more is None else loss + more, model)
@@ -174,7 +173,7 @@ def differentiate(
 def judge(
     frame: Frame,
     target: Tensor,
-    ssim_weight: float,
+    measure: Measure,
     tile_weights: Tensor | None = None,
     counted: Tensor | None = None,
     normal: float = 1.0,
@@ -190,14 +189,14 @@ def judge(
         rgb = _right_outside(counted, rgb, target)
     if normal < 1:
         rgb = _right_outside(inliers(rgb, target, normal), rgb, target)
-    errors = None if ssim_weight > 0 else tile_errors(rgb, target)
+    errors = None if measure.ssim > 0 else tile_errors(rgb, target, measure.quadratic)
     if moving is not None and errors is not None:
         alone = _right_outside(moving.mask, rgb, target)
-        errors = errors + moving.weight * tile_errors(alone, target)
+        errors = errors + moving.weight * tile_errors(alone, target, measure.quadratic)
     if errors is None or tile_weights is None:
-        loss = unweighted = photometric_loss(rgb, target, ssim_weight)
+        loss = unweighted = photometric_loss(rgb, target, measure)
         if moving is not None:
-            loss = unweighted = loss + _of_moving(rgb, target, ssim_weight, moving)
+            loss = unweighted = loss + _of_moving(rgb, target, measure, moving)
     else:
         errors = errors * (tile_weights > 0)
         loss = ((errors * tile_weights).sum() / target.numel()).to(rgb.dtype)
@@ -211,7 +210,7 @@ def _right_outside(counted: Tensor, rgb: Tensor, target: Tensor) -> Tensor:
     return torch.where(counted.to(rgb.device)[..., None], rgb, true)
 
 
-def _of_moving(rgb: Tensor, target: Tensor, ssim_weight: float, moving: Moving) -> Tensor:
+def _of_moving(rgb: Tensor, target: Tensor, measure: Measure, moving: Moving) -> Tensor:
     """Return the weighted loss of a picture of which all is right but what moves.
 
     Only the box around that is looked at, wider by what windows of SSIM reach on either side: what
@@ -227,5 +226,5 @@ def _of_moving(rgb: Tensor, target: Tensor, ssim_weight: float, moving: Moving) 
     wanted = target[:, box[0], box[1]].contiguous()
     shown = _right_outside(moving.mask[box], rgb[box], wanted)
     share = (bottom - top) * (right - left) / (height * width)
-    loss: Tensor = moving.weight * share * photometric_loss(shown, wanted, ssim_weight)
+    loss: Tensor = moving.weight * share * photometric_loss(shown, wanted, measure)
     return loss

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from gsdmsr_cli.gaussians.frame import Frame
 from gsdmsr_cli.gaussians.moment import Moment
+from gsdmsr_cli.ground.measure import Measure
 from gsdmsr_cli.ground.splatting_constants import tile_grid
 from gsdmsr_cli.model.layer import Instant
 from gsdmsr_cli.model.model import Model
@@ -172,7 +173,7 @@ class TrainingRenderer:
         assert isinstance(self.engine, ComparingViews)
         return compare_views(
             self.engine, model, moments, [look.camera for look in looks], self.background,
-            [look.target for look in looks], self._ssim_weight(phase.progress, phase.frozen),
+            [look.target for look in looks], self._measure(phase.progress, phase.frozen),
             self._sh_degree(phase.progress),
             [self._on_device(look.order.tile_weights) for look in looks], further,
         )  # fmt: skip
@@ -185,7 +186,7 @@ class TrainingRenderer:
         camera, mask = looks[0].camera, phase.gradient_mask
         return (
             len(looks), camera.width, camera.height, phase.moving, mask is not None,
-            self._ssim_weight(phase.progress, phase.frozen), self._sh_degree(phase.progress),
+            self._measure(phase.progress, phase.frozen), self._sh_degree(phase.progress),
             constants, tuple((p.tensor.data_ptr(), p.tensor.shape) for p in model.parameters()),
         )  # fmt: skip
 
@@ -224,7 +225,7 @@ class TrainingRenderer:
         moment = moments[look.instant]
         found = compare(
             self.engine, model, model.as_seen(moment, look.instant), look.instant, look.camera,
-            self.background, look.target, self._ssim_weight(phase.progress, phase.frozen),
+            self.background, look.target, self._measure(phase.progress, phase.frozen),
             self._sh_degree(phase.progress), self._on_device(look.order.tile_weights), look.mask,
             self.preset.losses.inliers, phase.screens, self._further(model, look, moments, phase),
             look.moving,
@@ -295,7 +296,7 @@ class TrainingRenderer:
 
         ``frozen`` is as in ``Phase``.
         """
-        if self._ssim_weight(progress, frozen) > 0:
+        if self._measure(progress, frozen).ssim > 0:
             return 0
         camera = self.camera(view, progress)
         return math.prod(tile_grid(camera.width, camera.height))
@@ -311,11 +312,13 @@ class TrainingRenderer:
         self._halved.release()
         return self.pictures
 
-    def _ssim_weight(self, progress: float, frozen: bool) -> float:
+    def _measure(self, progress: float, frozen: bool) -> Measure:
+        """Return how pictures are compared; ``frozen`` is as in ``Phase``."""
         losses = self.preset.losses
         if frozen:
-            return self.preset.stream.ssim
-        return losses.ssim if progress < losses.ssim_until else 0.0
+            return Measure(self.preset.stream.ssim)
+        ssim = losses.ssim if progress < losses.ssim_until else 0.0
+        return Measure(ssim, losses.quadratic if progress >= losses.quadratic_from else 0.0)
 
     def _sh_degree(self, progress: float) -> int:
         """Return the degree of colour; degree d joins at d times ``sh_start``."""

@@ -149,8 +149,9 @@ def test_a_wrong_loss_is_found_out() -> None:
 @pytest.mark.parametrize(
     ("name", "broken"),
     [
-        ("SSIM loss", lambda ssim_weight, weights: ssim_weight > 0),
-        ("loss of weighted tiles", lambda ssim_weight, weights: weights is not None),
+        ("SSIM loss", lambda measure, weights: measure.ssim > 0),
+        ("loss of squares", lambda measure, weights: measure.quadratic > 0),
+        ("loss of weighted tiles", lambda measure, weights: weights is not None),
     ],
 )
 def test_every_loss_is_looked_at(name: str, broken: Callable[..., bool]) -> None:

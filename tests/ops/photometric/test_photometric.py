@@ -14,13 +14,17 @@ from torch import Tensor
 from gsdmsr_cli.evaluation.metrics import ssim
 from gsdmsr_cli.gaussians.moment import Moment
 from gsdmsr_cli.gaussians.splats import Splats
+from gsdmsr_cli.ground.measure import Measure
 from gsdmsr_cli.ground.splatting_constants import TILE
 from gsdmsr_cli.ops.photometric import photometric_loss, photometric_loss_twin
 from gsdmsr_cli.raster import cpu
 from gsdmsr_cli.scene.camera import Camera
 
 SIZES = [(1, 1), (5, 3), (16, 16), (17, 33), (37, 50), (64, 15)]
-WEIGHTS = [0.0, 0.2, 1.0]
+MEASURES = [
+    Measure(0.0), Measure(0.2), Measure(1.0), Measure(0.0, 0.1), Measure(0.2, 0.3),
+    Measure(0.0, 9.0),
+]  # fmt: skip
 
 
 def target_of(height: int, width: int) -> Tensor:
@@ -31,43 +35,53 @@ def picture_of(height: int, width: int, seed: int = 0) -> Tensor:
     return torch.rand(height, width, 3, generator=generator(seed)) * 1.4 - 0.2
 
 
-def assert_matches_the_twin(rgb: Tensor, target: Tensor, weight: float, leaf: Tensor) -> None:
+def distance(difference: float, quadratic: float) -> float:
+    """Return Huber's loss in units of a fortieth, or the size of a difference."""
+    size = abs(difference)
+    if not quadratic:
+        return size
+    return 40 * (size**2 / 2 if size <= quadratic else quadratic * (size - quadratic / 2))
+
+
+def assert_matches_the_twin(rgb: Tensor, target: Tensor, measure: Measure, leaf: Tensor) -> None:
     """Compare value and gradient, the latter in ``leaf``, of which ``rgb`` may be a view."""
     exact = rgb.detach().double().requires_grad_()
-    found = photometric_loss(rgb, target, weight)
-    truth = photometric_loss_twin(exact, target, weight)
+    found = photometric_loss(rgb, target, measure)
+    truth = photometric_loss_twin(exact, target, measure)
     assert found.item() == pytest.approx(truth.item(), rel=1e-5, abs=1e-6)
     (3 * found).backward()
     (3 * truth).backward()
     assert leaf.grad is not None
     gradient = leaf.grad if leaf is rgb else cpu.cropped(leaf.grad, *rgb.shape[:2])
-    assert_near(gradient, exact.grad, 1e-3 if weight else 1e-6, "gradient")
+    assert_near(gradient, exact.grad, 1e-3 if measure.ssim else 1e-6, "gradient")
 
 
-@pytest.mark.parametrize("weight", WEIGHTS)
+@pytest.mark.parametrize("measure", MEASURES)
 @pytest.mark.parametrize(("height", "width"), SIZES)
-def test_a_plain_picture_matches_the_twin(height: int, width: int, weight: float) -> None:
+def test_a_plain_picture_matches_the_twin(height: int, width: int, measure: Measure) -> None:
     rgb = picture_of(height, width).requires_grad_()
-    assert_matches_the_twin(rgb, target_of(height, width), weight, rgb)
+    assert_matches_the_twin(rgb, target_of(height, width), measure, rgb)
 
 
-@pytest.mark.parametrize("weight", WEIGHTS)
+@pytest.mark.parametrize("measure", MEASURES)
 @pytest.mark.parametrize(("height", "width"), SIZES)
-def test_a_crop_of_padded_planes_matches_the_twin(height: int, width: int, weight: float) -> None:
+def test_a_crop_of_padded_planes_matches_the_twin(
+    height: int, width: int, measure: Measure
+) -> None:
     """What lies beyond the crop is what the engine drew there, and must not count."""
     rows, columns = (-(-size // TILE) * TILE for size in (height, width))
     planes = torch.rand(3, rows, columns, generator=generator(2)).requires_grad_()
     rgb = cpu.cropped(planes, height, width)
-    assert_matches_the_twin(rgb, target_of(height, width), weight, planes)
+    assert_matches_the_twin(rgb, target_of(height, width), measure, planes)
     assert planes.grad is not None
     assert not planes.grad[:, height:].any() and not planes.grad[:, :, width:].any()
 
 
-@given(st.integers(1, 40), st.integers(1, 40), st.sampled_from(WEIGHTS))
+@given(st.integers(1, 40), st.integers(1, 40), st.sampled_from(MEASURES))
 @settings(max_examples=30, deadline=None)
-def test_any_size_matches_the_twin(height: int, width: int, weight: float) -> None:
+def test_any_size_matches_the_twin(height: int, width: int, measure: Measure) -> None:
     rgb = picture_of(height, width, seed=height).requires_grad_()
-    assert_matches_the_twin(rgb, target_of(height, width), weight, rgb)
+    assert_matches_the_twin(rgb, target_of(height, width), measure, rgb)
 
 
 def drawn_by_the_engine(height: int, width: int) -> tuple[Tensor, Splats]:
@@ -89,7 +103,7 @@ def test_a_picture_of_the_cpu_engine_matches_the_twin_through_to_the_splats() ->
     target, gradients = target_of(37, 50), []
     for compare in (photometric_loss, photometric_loss_twin):
         rgb, splats = drawn_by_the_engine(37, 50)
-        loss = compare(rgb, target, 0.2)
+        loss = compare(rgb, target, Measure(0.2))
         loss.backward()
         gradients.append([loss, *(tensor.grad for tensor in splats.tensors().values())])
     for i, (found, twin) in enumerate(zip(*gradients, strict=True)):
@@ -100,18 +114,20 @@ def test_a_picture_of_the_cpu_engine_matches_the_twin_through_to_the_splats() ->
 def test_the_loss_leaves_its_picture_and_target_as_they_are() -> None:
     rgb, target = picture_of(20, 18), target_of(20, 18)
     before = rgb.clone(), target.clone()
-    photometric_loss(rgb, target, 0.2)
+    photometric_loss(rgb, target, Measure(0.2))
     assert torch.equal(rgb, before[0]) and torch.equal(target, before[1])
 
 
-@pytest.mark.parametrize("weight", WEIGHTS)
+@pytest.mark.parametrize("measure", MEASURES)
 @pytest.mark.parametrize(("height", "width"), SIZES)
-def test_twin_is_l1_and_the_ssim_of_evaluation(height: int, width: int, weight: float) -> None:
+def test_twin_is_the_distance_and_the_ssim_of_evaluation(
+    height: int, width: int, measure: Measure
+) -> None:
     rgb, target = picture_of(height, width).double().clamp(0, 1), target_of(height, width)
     wanted = target.permute(1, 2, 0).double() / 255
-    l1 = float((rgb - wanted).abs().mean())
-    expected = (1 - weight) * l1 + weight * (1 - ssim(rgb, wanted))
-    assert float(photometric_loss_twin(rgb, target, weight)) == pytest.approx(expected, rel=1e-6)
+    apart = np.mean([distance(d, measure.quadratic) for d in (rgb - wanted).flatten().tolist()])
+    expected = (1 - measure.ssim) * apart + measure.ssim * (1 - ssim(rgb, wanted))
+    assert float(photometric_loss_twin(rgb, target, measure)) == pytest.approx(expected, rel=1e-6)
 
 
 def test_twin_has_the_ssim_of_scikit_image_with_zeros_around() -> None:
@@ -123,20 +139,22 @@ def test_twin_has_the_ssim_of_scikit_image_with_zeros_around() -> None:
         gaussian_weights=True, sigma=1.5, use_sample_covariance=False,
     )  # fmt: skip
     expected = 1 - values[16:-16, 16:-16].mean()
-    assert float(photometric_loss_twin(rgb, target, 1.0)) == pytest.approx(expected, rel=1e-6)
+    assert float(photometric_loss_twin(rgb, target, Measure(1.0))) == pytest.approx(
+        expected, rel=1e-6
+    )
 
 
-@pytest.mark.parametrize("weight", [0.2, 1.0])
-def test_twin_passes_gradcheck(weight: float) -> None:
+@pytest.mark.parametrize("measure", [Measure(0.2), Measure(1.0), Measure(0.2, 0.3)])
+def test_twin_passes_gradcheck(measure: Measure) -> None:
     rgb, target = picture_of(6, 7).double().requires_grad_(), target_of(6, 7)
-    assert torch.autograd.gradcheck(lambda x: photometric_loss_twin(x, target, weight), (rgb,))
+    assert torch.autograd.gradcheck(lambda x: photometric_loss_twin(x, target, measure), (rgb,))
 
 
-@pytest.mark.parametrize("weight", WEIGHTS)
-def test_a_perfect_picture_has_no_loss(weight: float) -> None:
+@pytest.mark.parametrize("measure", MEASURES)
+def test_a_perfect_picture_has_no_loss(measure: Measure) -> None:
     target = target_of(20, 30)
     rgb = target.permute(1, 2, 0).float() / 255
-    assert photometric_loss(rgb, target, weight).item() == pytest.approx(0, abs=1e-6)
+    assert photometric_loss(rgb, target, measure).item() == pytest.approx(0, abs=1e-6)
 
 
 def test_results_do_not_depend_on_the_number_of_threads() -> None:
@@ -144,7 +162,7 @@ def test_results_do_not_depend_on_the_number_of_threads() -> None:
 
     def compute() -> list[Tensor]:
         rgb = picture_of(70, 53).requires_grad_()
-        loss = photometric_loss(rgb, target, 0.2)
+        loss = photometric_loss(rgb, target, Measure(0.2))
         loss.backward()
         assert rgb.grad is not None
         return [loss, rgb.grad]

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from gsdmsr_cli.gaussians.moment import Moment
 from gsdmsr_cli.gaussians.splats import Splats
+from gsdmsr_cli.ground.measure import Measure
 from gsdmsr_cli.ground.splatting_constants import DILATION, tile_grid
 from gsdmsr_cli.ops.photometric import photometric_loss_twin
 from gsdmsr_cli.ops.rasterize.cuda import room, stages
@@ -58,9 +59,9 @@ def assert_near(found: Tensor, expected: Tensor, tolerance: float = 1e-4) -> Non
     assert error <= tolerance * expected.double().norm() + 1e-9
 
 
-@pytest.mark.parametrize("ssim", [0.0, 0.2])
+@pytest.mark.parametrize("measure", [Measure(0.0), Measure(0.2), Measure(0.0, 0.2)])
 @pytest.mark.parametrize("moves", [False, True], ids=["at rest", "moving"])
-def test_views_at_once_are_the_views_one_by_one(place: str, ssim: float, moves: bool) -> None:
+def test_views_at_once_are_the_views_one_by_one(place: str, measure: Measure, moves: bool) -> None:
     base = splats(70).map(lambda t: t.detach().to(place).requires_grad_())
     shifts = [torch.zeros(70, 3), 0.2 * torch.randn(70, 3, generator=generator(5)), torch.ones(3)]
     shifts = [shift.to(place) for shift in shifts]
@@ -68,14 +69,14 @@ def test_views_at_once_are_the_views_one_by_one(place: str, ssim: float, moves: 
     cameras = [camera(angle) for angle in (0.1, 1.0, 2.5)]
     targets = [target(seed).to(place) for seed in range(3)]
     leaves = list(base.tensors().values())
-    together, views = cuda.compare_views(moments, cameras, BACKGROUND, targets, ssim)
+    together, views = cuda.compare_views(moments, cameras, BACKGROUND, targets, measure)
     found = torch.autograd.grad(together, leaves, retain_graph=True)
     expected = [torch.zeros_like(leaf) for leaf in leaves]
     for moment, where, wanted, view in zip(moments, cameras, targets, views, strict=True):
-        alone = cuda.compare(moment, where, BACKGROUND, wanted, ssim)
+        alone = cuda.compare(moment, where, BACKGROUND, wanted, measure)
         assert_near(view.loss, alone.loss, 1e-6)
         assert_near(view.on_screen, alone.on_screen)
-        assert (view.errors is None) == (alone.errors is None) == (ssim > 0)
+        assert (view.errors is None) == (alone.errors is None) == (measure.ssim > 0)
         if view.errors is not None and alone.errors is not None:
             assert_near(view.errors, alone.errors, 1e-6)
         for total, part in zip(
@@ -94,11 +95,11 @@ def test_axes_are_shared_by_views_or_their_own(place: str, moves: bool) -> None:
     moments = [Moment(base, axes * (1 + i) if moves else axes) for i in range(2)]
     cameras, targets = [camera(0.1), camera(1.0)], [target(s).to(place) for s in (0, 1)]
     leaves = [base.means, base.logit_opacities, base.sh, axes]
-    together, _ = cuda.compare_views(moments, cameras, BACKGROUND, targets, 0.0)
+    together, _ = cuda.compare_views(moments, cameras, BACKGROUND, targets, Measure(0.0))
     found = torch.autograd.grad(together, leaves, retain_graph=True)
     expected = [torch.zeros_like(leaf) for leaf in leaves]
     for moment, where, wanted in zip(moments, cameras, targets, strict=True):
-        alone = cuda.compare(moment, where, BACKGROUND, wanted, 0.0)
+        alone = cuda.compare(moment, where, BACKGROUND, wanted, Measure(0.0))
         parts = torch.autograd.grad(alone.loss, leaves, retain_graph=True)
         for total, part in zip(expected, parts, strict=True):
             total += part
@@ -110,7 +111,7 @@ def test_axes_are_shared_by_views_or_their_own(place: str, moves: bool) -> None:
 def test_moments_with_axes_and_without_are_not_drawn_at_once() -> None:
     mixed = [Moment(splats(3)), Moment(splats(3), torch.eye(3).expand(3, 3, 3))]
     with pytest.raises(ValueError, match="with axes and without cannot be drawn at once"):
-        cuda.compare_views(mixed, [camera(0.0)] * 2, BACKGROUND, [target(0)] * 2, 0.0)
+        cuda.compare_views(mixed, [camera(0.0)] * 2, BACKGROUND, [target(0)] * 2, Measure(0.0))
 
 
 def test_every_view_has_its_own_tile_weights() -> None:
@@ -120,10 +121,12 @@ def test_every_view_has_its_own_tile_weights() -> None:
     weights[0][1] = 0
     targets = [target(0), target(1)]
     _, views = cuda.compare_views(
-        [Moment(base)] * 2, cameras, BACKGROUND, targets, 0.0, tile_weights=weights
+        [Moment(base)] * 2, cameras, BACKGROUND, targets, Measure(0.0), tile_weights=weights
     )
     for where, wanted, own, view in zip(cameras, targets, weights, views, strict=True):
-        alone = cuda.compare(Moment(base), where, BACKGROUND, wanted, 0.0, tile_weights=own)
+        alone = cuda.compare(
+            Moment(base), where, BACKGROUND, wanted, Measure(0.0), tile_weights=own
+        )
         assert_near(view.loss, alone.loss, 1e-6)
         assert_near(view.on_screen, alone.on_screen)
 
@@ -141,7 +144,7 @@ def test_views_that_cannot_be_drawn_at_once_are_refused(cameras: list[Camera]) -
 @pytest.mark.parametrize("wrong", [target(0).float(), target(0)[:, 1:], target(0).flip(2).mT])
 def test_targets_must_fit(wrong: Tensor) -> None:
     with pytest.raises(ValueError, match="uint8"):
-        cuda.compare(Moment(splats(3)), camera(0.0), BACKGROUND, wrong, 0.0)
+        cuda.compare(Moment(splats(3)), camera(0.0), BACKGROUND, wrong, Measure(0.0))
 
 
 def test_more_tiles_than_two_bytes_can_tell_apart() -> None:
@@ -188,18 +191,19 @@ def test_entries_of_a_tile_lie_front_to_back_and_name_blocks() -> None:
     assert ((bits > 0) & (bits < 256)).all()
 
 
+@pytest.mark.parametrize("measure", [Measure(0.2), Measure(0.2, 0.3)])
 @pytest.mark.parametrize("size", [(1, 1), (5, 40), (16, 16), (35, 22)])
-def test_the_loss_is_that_of_its_twin(place: str, size: tuple[int, int]) -> None:
+def test_the_loss_is_that_of_its_twin(place: str, size: tuple[int, int], measure: Measure) -> None:
     width, height = size
     view = stages.views_of([camera(0.0, width, height)] * 2)
     rgb = torch.rand(2, 3, height, width, generator=generator())
     shape = 3, height, width
     targets = [torch.randint(256, shape, generator=generator(s), dtype=torch.uint8) for s in (1, 2)]
     there = [wanted.to(place) for wanted in targets]
-    losses, gradient = (t.cpu() for t in stages.compare(view, rgb.to(place), there, 0.2))
+    losses, gradient = (t.cpu() for t in stages.compare(view, rgb.to(place), there, measure))
     for i, wanted in enumerate(targets):
         exact = rgb[i].permute(1, 2, 0).double().requires_grad_()
-        loss = photometric_loss_twin(exact, wanted, 0.2)
+        loss = photometric_loss_twin(exact, wanted, measure)
         loss.backward()
         assert exact.grad is not None
         assert_near(losses[i], loss.detach(), 1e-5)

@@ -12,9 +12,11 @@ from training_checks import counted_ways_back, preset_of, trainer_of
 
 from gsdmsr_cli.gaussians.frame import Frame
 from gsdmsr_cli.gaussians.moment import Moment
+from gsdmsr_cli.ground.measure import Measure
 from gsdmsr_cli.model.layer import Instant
 from gsdmsr_cli.model.model import STORED_AS, Model
 from gsdmsr_cli.ops.photometric import photometric_loss_twin
+from gsdmsr_cli.ops.photometric.twin import distances
 from gsdmsr_cli.raster import load_engine
 from gsdmsr_cli.scene.camera import Camera
 from gsdmsr_cli.training.gradients.compare import Moving, compare
@@ -46,12 +48,13 @@ def compared(
     screens: bool = True,
     further: Tensor | None = None,
     moving: Moving | None = None,
+    quadratic: float = 0.0,
 ) -> ViewGradients:
     model: Model = trainer.model
     camera: Camera = trainer.renderer.pictures.camera(trainer.views[0])
     return compare(
         load_engine(engine), model, Moment(model.splats), Instant(0.0), camera, BACKGROUND, target,
-        ssim, 1, weights, counted, normal, screens, further, moving,
+        Measure(ssim, quadratic), 1, weights, counted, normal, screens, further, moving,
     )  # fmt: skip
 
 
@@ -76,7 +79,7 @@ def test_pixels_that_do_not_count_are_taken_for_right(
     counted = half(*target.shape[1:])
     true = target.permute(1, 2, 0).double() / 255
     rgb = torch.where(counted[..., None], drawn(trainer).rgb.double(), true)
-    expected = photometric_loss_twin(rgb, target, ssim).item()
+    expected = photometric_loss_twin(rgb, target, Measure(ssim)).item()
     found = compared(trainer, target, ssim, counted, engine).loss.item()
     assert found == pytest.approx(expected, rel=1e-4)
 
@@ -96,7 +99,8 @@ def test_what_moves_counts_again_as_if_all_else_were_right(
     frame = drawn(trainer)
     rgb, true = frame.rgb.double(), target.permute(1, 2, 0).double() / 255
     alone = torch.where(mask[..., None], rgb, true)
-    loss = photometric_loss_twin(rgb, target, ssim) + 3 * photometric_loss_twin(alone, target, ssim)
+    of_all, of_moving = (photometric_loss_twin(x, target, Measure(ssim)) for x in (rgb, alone))
+    loss = of_all + 3 * of_moving
     wanted = [*trainer.model.trained().values(), frame.means2d]
     expected = torch.autograd.grad(loss, wanted, allow_unused=True)
     found = compared(trainer, target, ssim, None, engine, moving=Moving(mask, 3.0))
@@ -108,12 +112,16 @@ def test_what_moves_counts_again_as_if_all_else_were_right(
             torch.testing.assert_close(one, other, rtol=1e-2, atol=atol)
 
 
-def test_what_moves_counts_more_in_tiles_too(trainer: Trainer) -> None:
+@pytest.mark.parametrize("quadratic", [0.0, 0.2])
+def test_what_moves_counts_more_in_tiles_too(trainer: Trainer, quadratic: float) -> None:
     target = trainer.renderer.pictures.load(trainer.views[0])
     weights, mask = torch.tensor([0.0, 4.5, 0.5, 2.0, 0, 0, 0, 9.0, 1.0]), half(48, 48)
-    errors = (drawn(trainer).rgb - target.permute(1, 2, 0) / 255).abs().sum(dim=2) * (1 + 3 * mask)
+    differences = drawn(trainer).rgb - target.permute(1, 2, 0) / 255
+    errors = distances(differences, quadratic).sum(dim=2) * (1 + 3 * mask)
     per_tile = errors.detach().view(3, 16, 3, 16).sum(dim=(1, 3)).flatten()
-    found = compared(trainer, target, 0.0, None, weights=weights, moving=Moving(mask, 3.0))
+    found = compared(
+        trainer, target, 0.0, None, weights=weights, moving=Moving(mask, 3.0), quadratic=quadratic
+    )
     expected = float((per_tile * weights).sum() / target.numel())
     assert found.loss.item() == pytest.approx(expected, rel=1e-4)
     assert found.tile_errors is not None

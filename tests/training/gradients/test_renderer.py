@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from datasets import noise, write_picture
+from seam_checks import assert_trains_the_same_in_all_ways
 from training_checks import STEPS, counted_ways_back, preset_of, trainer_of
 
 from gsdmsr_cli.gaussians.moment import Moment
@@ -106,12 +107,19 @@ def test_half_the_size_counts_where_half_of_the_pixels_do(tmp_path: Path) -> Non
     assert pictures.signal(replace(view, signals={}), MASK) is None
 
 
+def test_what_counts_by_its_square_trains_the_same_in_all_ways(
+    tiny_scene: Path, tmp_path: Path
+) -> None:
+    options = "{quadratic: 0.1, quadratic_from: 0, ssim: 0.2, ssim_until: 0.5}"
+    assert_trains_the_same_in_all_ways(tiny_scene, tmp_path, f"losses={options}")
+
+
 def test_terms_cost_no_further_way_back_through_the_picture(
     tiny_scene: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     times = counted_ways_back(monkeypatch)
     found = {}
-    for terms in ("[]", "[{name: temporal_smoothness, factor: 10.0}]"):
+    for terms in ("[]", "[{name: temporal_smoothness, factor: 100.0}]"):
         trainer = trainer_of(tiny_scene, preset_of(f"losses.terms={terms}"))
         trainer.population.begin_moving()
         rng = torch.Generator().manual_seed(1)

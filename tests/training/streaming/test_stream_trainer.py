@@ -13,6 +13,7 @@ from training_checks import assert_same_tensors, copies, run_of
 
 from gsdmsr_cli.backends.cpu import jit
 from gsdmsr_cli.drawing.splatting import draw
+from gsdmsr_cli.ground.measure import Measure
 from gsdmsr_cli.ops.photometric import photometric_loss
 from gsdmsr_cli.training.gradients.phase import Order, Phase
 from gsdmsr_cli.training.losses import Seen
@@ -94,7 +95,7 @@ def test_ssim_has_a_weight_of_its_own_after_the_first_moment(rig: Path, weight: 
                 trainer.model, pictures.camera(view), view.time, trainer.renderer.engine,
                 trainer.renderer.background, of_capture=True,
             )  # fmt: skip
-            return float(photometric_loss(frame.rgb, pictures.load(view), of_ssim))
+            return float(photometric_loss(frame.rgb, pictures.load(view), Measure(of_ssim)))
 
     through(trainer, 1)
     assert told() == pytest.approx(expected(0.5), rel=1e-4)

@@ -290,8 +290,8 @@ def blend_backward(
 
 
 @inline
-def _compare_plain(row, target, background, top, left, bottom, right):
-    """Return the sum of |background - target| over a tile that no splat touches."""
+def _compare_plain(row, target, background, top, left, bottom, right, steep, half):
+    """Return the sum of the background's distances over a tile that no splat touches."""
     pixels, width, plane = target.reshape(-1), target.shape[2], target.shape[1] * target.shape[2]
     total, covered = simd.splat(float32(0)), simd.first_lanes(right - left)
     for channel in range(3):
@@ -299,13 +299,15 @@ def _compare_plain(row, target, background, top, left, bottom, right):
         for y in range(top, bottom):
             at = channel * plane + y * width + left
             wanted = load_target(pixels, at, right - left, row)
-            total = total + distances(shade - wanted, float32(0))[0]
+            total = total + distances(shade - wanted, float32(0), steep, half)[0]
     return simd.reduce_sum(total)
 
 
 @inline
-def _compare(block, row, target, background, top, left, bottom, right, weight):
-    """Return the sum of |rgb - target| of a drawn tile, and prepare its block for gradients."""
+def _compare(
+    block, row, target, background, top, left, bottom, right, weight, steep, half
+):  # fmt: skip
+    """Return the sum of the distances of a drawn tile, and prepare its block for gradients."""
     pixels, width, plane = target.reshape(-1), target.shape[2], target.shape[1] * target.shape[2]
     one, zero = simd.splat(float32(1)), simd.splat(float32(0))
     total, covered = zero, simd.first_lanes(right - left)
@@ -317,8 +319,8 @@ def _compare(block, row, target, background, top, left, bottom, right, weight):
             if top + y < bottom:
                 at = channel * plane + (top + y) * width + left
                 wanted = load_target(pixels, at, right - left, row)
-                distance, slope = distances(shade * covered - wanted, weight)
-                total = total + distance
+                apart, slope = distances(shade * covered - wanted, weight, steep, half)
+                total = total + apart
             rest = rest + slope * shade
             colour = simd.load(block, (2 + channel) * _BLOCK + o)  # its place is taken next
             simd.store(block, (2 + channel) * _BLOCK + o, slope)
@@ -328,21 +330,22 @@ def _compare(block, row, target, background, top, left, bottom, right, weight):
 
 
 @parallel
-def blend_l1(
-    records, entries, starts, busiest, columns, background, target, weight, tile_weights, losses,
-    sums,
+def blend_and_compare(
+    records, entries, starts, busiest, columns, background, target, weight, steep, half,
+    tile_weights, losses, sums,
 ):  # fmt: skip
     """Draw tiles, compare them with the target and take the gradients while they are at hand.
 
-    What ``blend``, ``photometric.l1`` and ``blend_backward`` do one after another, without a
+    What ``blend``, ``photometric.distance`` and ``blend_backward`` do one after another, without a
     picture in between.
 
     Args:
         target: (3, H, W) uint8.
-        weight: of each absolute difference in the loss.
+        weight: of each distance in the loss.
+        steep, half: see ``photometric.distances``.
         tile_weights: (tiles,) float32, further factors on the loss of each tile; those of weight 0
             are not drawn. (0,) stands for 1 everywhere.
-        losses: (tiles,) out, sums of absolute differences, without the tiles' weights.
+        losses: (tiles,) out, sums of the distances, without the tiles' weights.
         others: see ``blend`` and ``blend_backward``.
     """
     height, width = target.shape[1], target.shape[2]
@@ -362,14 +365,16 @@ def blend_l1(
             bottom, right = min(top + TILE, height), min(left + TILE, width)
             start, end = starts[tile], starts[tile + 1]
             if start == end:
-                losses[tile] = _compare_plain(row, target, background, top, left, bottom, right)
+                losses[tile] = _compare_plain(
+                    row, target, background, top, left, bottom, right, steep, half
+                )
                 continue
             if (end - start) * _BLOCK > kept.shape[0]:
                 kept = np.empty((end - start) * _BLOCK, np.float32)
                 ranges = np.empty(((end - start + 15) >> 4, 2), np.int32)
             end = _draw_and_keep(block, kept, ranges, records, entries, start, end, x0, y0)
             losses[tile] = _compare(
-                block, row, target, background, top, left, bottom, right, weight
+                block, row, target, background, top, left, bottom, right, weight, steep, half
             )
             _differentiate_kept(
                 block, kept, ranges, records, entries, start, end, x0, y0, tile_weight, own

@@ -9,14 +9,14 @@ import numpy as np
 
 from gsdmsr_cli.backends.cpu.jit import serial
 from gsdmsr_cli.ground.splatting_constants import TILE
-from gsdmsr_cli.ops.photometric.cpu import compare
+from gsdmsr_cli.ops.photometric.cpu import bend, compare
 from gsdmsr_cli.ops.rasterize.cpu.binning import assign, leave_out
 from gsdmsr_cli.ops.rasterize.cpu.blending import (
     PARTS,
     RECORD,
     blend,
+    blend_and_compare,
     blend_backward,
-    blend_l1,
     gather,
     pack,
 )
@@ -27,15 +27,15 @@ from gsdmsr_cli.ops.rasterize.cpu.projection import project, project_backward
 @serial
 def look(
     means, quats, log_scales, logit_opacities, sh, axes, terms, view, intrinsics, centre,
-    width, height, background, target, ssim_weight, threads, tile_weights, errors,
+    width, height, background, target, ssim_weight, quadratic, threads, tile_weights, errors,
     d_means, d_quats, d_log_scales, d_logit_opacities, d_sh, d_axes, on_screen,
 ):  # fmt: skip
     """Return the loss against ``target`` (3, H, W) uint8, and write its gradients.
 
     Arguments as in ``projection.project``, ``harmonics.colour``, ``blending.blend``,
-    ``blending.blend_l1``, ``blending.gather`` and ``photometric.compare``; every ``d_`` argument
-    has the shape of what it is the gradient of. Tiles can only be weighted, and have an error each,
-    if SSIM has no weight.
+    ``blending.blend_and_compare``, ``blending.gather`` and ``photometric.compare``; every ``d_``
+    argument has the shape of what it is the gradient of. Tiles can only be weighted, and have an
+    error each, if SSIM has no weight.
     """
     n = means.shape[0]
     means2d, conics = np.empty((n, 2), np.float32), np.empty((n, 3), np.float32)
@@ -62,17 +62,18 @@ def look(
         ends = np.empty(rows * columns, np.int32)
         blend(records, entries, starts, busiest, threads, columns, background, rgb, alpha, ends)
         d_rgb, d_alpha = np.empty_like(rgb), np.empty((0, 0), np.float32)
-        loss = compare(rgb, target, height, width, ssim_weight, d_rgb)
+        loss = compare(rgb, target, height, width, ssim_weight, quadratic, d_rgb)
         blend_backward(
             records, entries, starts, busiest, ends, columns, rgb, alpha, d_rgb, d_alpha, sums
         )
     else:
         count = 3 * height * width
-        weight = np.float32(1 / count)
-        blend_l1(
-            records, entries, starts, busiest, columns, background, target, weight, tile_weights,
-            errors, sums,
+        steep, half, unit = bend(quadratic)
+        blend_and_compare(
+            records, entries, starts, busiest, columns, background, target,
+            np.float32(unit / count), steep, half, tile_weights, errors, sums,
         )  # fmt: skip
+        errors *= unit
         if tile_weights.shape[0] > 0:
             loss = (errors * tile_weights).sum() / count
         else:

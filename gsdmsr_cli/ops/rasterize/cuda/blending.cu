@@ -293,12 +293,13 @@ extern "C" __global__ void __launch_bounds__(THREADS) blend_with_depth_backward(
 
 // Draws a tile, compares it with the target and takes the gradients while it is at hand.
 //
-// weight is that of each absolute difference in the loss; tile_weights (views, tiles) are further
-// factors on the loss of each tile, of which those of weight 0 are not drawn, or null for 1
-// everywhere. errors (views, tiles) get the sums of absolute differences without either weight.
-extern "C" __global__ void __launch_bounds__(THREADS) blend_l1(
+// weight is that of each distance in the loss, steep and half as in `distance_of`; tile_weights
+// (views, tiles) are further factors on the loss of each tile, of which those of weight 0 are not
+// drawn, or null for 1 everywhere. errors (views, tiles) get the sums of the distances without
+// either weight.
+extern "C" __global__ void __launch_bounds__(THREADS) blend_and_compare(
     int width, int height, Splats splats, const float *background,
-    const __grid_constant__ Targets targets, float weight,
+    const __grid_constant__ Targets targets, float weight, float steep, float half,
     const float *tile_weights, double *errors, float *sums
 ) {
     __shared__ Batch batch;
@@ -319,10 +320,11 @@ extern "C" __global__ void __launch_bounds__(THREADS) blend_l1(
         float red = drawn.x - target[at] * (1.0f / 255.0f);
         float green = drawn.y - target[at + plane] * (1.0f / 255.0f);
         float blue = drawn.z - target[at + 2 * plane] * (1.0f / 255.0f);
-        distance = fabsf(red) + fabsf(green) + fabsf(blue);
-        slope.x = slope_of_distance(red, weight);
-        slope.y = slope_of_distance(green, weight);
-        slope.z = slope_of_distance(blue, weight);
+        distance = distance_of(red, steep, half) + distance_of(green, steep, half)
+            + distance_of(blue, steep, half);
+        slope.x = slope_of_distance(red, weight, steep);
+        slope.y = slope_of_distance(green, weight, steep);
+        slope.z = slope_of_distance(blue, weight, steep);
         left = slope.x * drawn.x + slope.y * drawn.y + slope.z * drawn.z;
     }
     distance = warp_sum(distance);

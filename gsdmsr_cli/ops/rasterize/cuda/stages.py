@@ -18,6 +18,7 @@ from torch import Tensor
 from gsdmsr_cli.backends.cuda import recording
 from gsdmsr_cli.backends.cuda.compiler import MOST_VIEWS
 from gsdmsr_cli.backends.cuda.launch import blocks, launch, struct
+from gsdmsr_cli.ground.measure import ALIKE, Measure
 from gsdmsr_cli.ground.splatting_constants import TILE, tile_grid
 from gsdmsr_cli.ops.rasterize.cuda.room import Room
 from gsdmsr_cli.scene.camera import Camera
@@ -26,6 +27,7 @@ SUMS = 16
 """Floats for the sums of a splat, as in blending.cu."""
 
 _PIXELS = TILE * TILE
+_STEEPEST = 1e30
 _DIMENSIONS = {"means": 2, "quats": 2, "log_scales": 2, "logit_opacities": 1, "sh": 3, "axes": 3}
 """Of each stored tensor, when all views share it."""
 
@@ -307,34 +309,44 @@ def blend_backward(
     return sums
 
 
-def blend_l1(
+def blend_and_compare(
     views: Views,
     projected: Seen,
     bins: Bins,
     background: Tensor,
     targets: Sequence[Tensor],
     tile_weights: Tensor | None,
+    quadratic: float,
 ) -> tuple[Tensor, Tensor]:
-    """Draw, compare by the mean absolute difference and differentiate, tile by tile.
+    """Draw, compare by the mean distance of colours and differentiate, tile by tile.
 
     Args:
         views, projected, bins, background: as in ``blend``.
         targets: (3, H, W) uint8 of each view.
         tile_weights: (V tiles,) factors on the share of each tile in the loss; those of weight 0
             are not drawn. None for 1 everywhere.
+        quadratic: see ``Measure``.
 
     Returns:
-        (V, tiles) float64, sums of absolute differences without these weights; and sums as
+        (V, tiles) float64, sums of the distances without these weights; and sums as
         ``blend_backward`` does.
     """
     errors = background.new_empty(views.number, views.tiles, dtype=torch.float64)
     sums = background.new_zeros(len(projected[0]), SUMS)
+    steep, half, unit = _bend(quadratic)
     launch(
-        "blending", "blend_l1", (views.number * views.tiles, 1), _PIXELS,
+        "blending", "blend_and_compare", (views.number * views.tiles, 1), _PIXELS,
         views.width, views.height, _drawn(projected, bins), background, _targets(views, targets),
-        1 / (3 * views.width * views.height), tile_weights, errors, sums,
+        unit / (3 * views.width * views.height), steep, half, tile_weights, errors, sums,
     )  # fmt: skip
-    return errors, sums
+    return errors if unit == 1 else errors.mul_(unit), sums
+
+
+def _bend(quadratic: float) -> tuple[float, float, float]:
+    """Return what ``distance`` of common.cuh takes, and what its results are multiplied by."""
+    if quadratic == 0:
+        return _STEEPEST, 0.0, 1.0
+    return 1 / quadratic, quadratic / 2, quadratic / ALIKE
 
 
 def gather(shapes: Tensor, sums: Tensor, weighted: bool) -> tuple[Seen, Tensor]:
@@ -342,7 +354,7 @@ def gather(shapes: Tensor, sums: Tensor, weighted: bool) -> tuple[Seen, Tensor]:
 
     Args:
         shapes: (V N, 4).
-        sums: (V N, 16) of ``blend_backward`` or ``blend_l1``.
+        sums: (V N, 16) of ``blend_backward`` or ``blend_and_compare``.
         weighted: whether tiles had weights, so that the last result differs from the first.
     """
     rows = len(shapes)
@@ -356,15 +368,15 @@ def gather(shapes: Tensor, sums: Tensor, weighted: bool) -> tuple[Seen, Tensor]:
 
 
 def compare(
-    views: Views, rgb: Tensor, targets: Sequence[Tensor], ssim_weight: float
+    views: Views, rgb: Tensor, targets: Sequence[Tensor], measure: Measure
 ) -> tuple[Tensor, Tensor]:
-    """Return (1 - w) L1 + w (1 - SSIM) of each view, (V,) float64, and the gradient by rgb.
+    """Return the loss of each view, (V,) float64, and the gradient by rgb.
 
     Args:
         views: as before.
         rgb: (V, 3, H, W).
         targets: (3, H, W) uint8 of each view.
-        ssim_weight: w in [0, 1].
+        measure: what it is made of.
     """
     grid = views.tiles, 3 * views.number
     given = views.width, views.height, rgb, _targets(views, targets)
@@ -372,12 +384,14 @@ def compare(
     similar, distant = (rgb.new_empty(views.number, grid[0] * 3) for _ in range(2))
     launch("photometric", "ssim_maps", grid, _PIXELS, *given, maps, similar)
     count = 3 * views.width * views.height
+    steep, half, unit = _bend(measure.quadratic)
+    colours = (1 - measure.ssim) * unit
     launch(
         "photometric", "photometric_gradient", grid, _PIXELS,
-        *given, maps, (1 - ssim_weight) / count, -ssim_weight / count, gradient, distant,
+        *given, maps, colours / count, steep, half, -measure.ssim / count, gradient, distant,
     )  # fmt: skip
-    ssim, l1 = (part.double().sum(dim=1) / count for part in (similar, distant))
-    return (1 - ssim_weight) * l1 + ssim_weight * (1 - ssim), gradient
+    ssim, distance = (part.double().sum(dim=1) / count for part in (similar, distant))
+    return colours * distance + measure.ssim * (1 - ssim), gradient
 
 
 def _targets(views: Views, targets: Sequence[Tensor]) -> ctypes.Structure:
