@@ -301,7 +301,7 @@ def test_the_example_of_a_motion_trains_and_grows(linear: ModuleType, tmp_path: 
     options = [
         "motion={name: linear}", "splats.count=150", "training.steps=40", "density.start=10",
         "density.every=10", "density.until=1.0", "density.gradient=1e-9", "density.cap=400",
-        "density.reset_at=[]", "training.static_until=0.1",
+        "density.reset_at=[]", "training.static_until=0.1", "losses.quadratic=0",
     ]  # fmt: skip
     preset = load_preset("dnerf", None, options)
     pictures = Pictures((1.0, 1.0, 1.0), 1, 1 << 28)
