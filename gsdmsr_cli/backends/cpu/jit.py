@@ -39,7 +39,8 @@ def sources() -> list[Path]:
     """Return all files that kernels are compiled from: their own, and the constants."""
     ops = PACKAGE / "ops"
     kernels = [*ops.glob("*/cpu.py"), *ops.glob("*/cpu/*.py"), *HERE.glob("*.py")]
-    constants = [PACKAGE / "ground" / name for name in ("splatting_constants.py", "ssim.py")]
+    files = ("measure.py", "splatting_constants.py", "ssim.py")
+    constants = [PACKAGE / "ground" / name for name in files]
     return [*sorted(kernels), *constants]
 
 

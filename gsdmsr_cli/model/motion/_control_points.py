@@ -169,8 +169,8 @@ class ControlPoints(Layer):
         moment, spans = Moment(splats), (i / (_INSTANTS - 1) for i in range(_INSTANTS))
         ways = torch.stack([self.at(moment, Instant(t)).splats.means for t in spans])
         farthest = (ways - ways.mean(dim=0)).norm(dim=2).amax(dim=0)
-        even = spread.spacing(spread.spread_out(splats.means, len(self.control_points)))
-        apart = even.square().mean().sqrt().clamp(min=LEAST_SPACING * self.facts.bound)
+        even = spread.spread_out(splats.means, len(self.control_points))
+        apart = self._initial_log_radii(even).exp().square().mean().sqrt()
         shares: Tensor = (farthest / apart.to(farthest)).clamp(max=1)
         return 1 + (self._gather - 1) * shares
 

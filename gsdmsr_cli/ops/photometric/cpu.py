@@ -26,6 +26,7 @@ WINDOW = ssim.WINDOW.astype(np.float32)
 _W0, _W1, _W2, _W3, _W4, _W5 = (float32(w) for w in WINDOW[: _REACH + 1])
 _SCALE = float32(1 / 255)
 _STEEPEST = float32(1e30)
+"""1 / q of a q that any difference is beyond."""
 
 
 @parallel

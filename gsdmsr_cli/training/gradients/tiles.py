@@ -21,7 +21,7 @@ class TileSampler:
 
     Attributes:
         count: tiles to choose of each view; 0 is all.
-        errors: by view, (tiles,) float64 sums of absolute differences when the tile was last drawn,
+        errors: by view, (tiles,) float64 sums of distances when the tile was last drawn,
             NaN before that.
     """
 

@@ -28,6 +28,7 @@ SUMS = 16
 
 _PIXELS = TILE * TILE
 _STEEPEST = 1e30
+"""1 / q of a q that any difference of colours is beyond."""
 _DIMENSIONS = {"means": 2, "quats": 2, "log_scales": 2, "logit_opacities": 1, "sh": 3, "axes": 3}
 """Of each stored tensor, when all views share it."""
 
