@@ -29,11 +29,7 @@ PLUGINS = (
 KERNELS = "ops/*/cpu.py", "ops/*/cpu/*.py", "backends/cpu/*.py"
 """Where the kernels of the CPU are."""
 
-CONSTANTS = {
-    "gsdmsr_cli.ground.measure",
-    "gsdmsr_cli.ground.splatting_constants",
-    "gsdmsr_cli.ground.ssim",
-}
+CONSTANTS = {"gsdmsr_cli.ground.splatting_constants", "gsdmsr_cli.ground.ssim"}
 """What is compiled into kernels besides themselves."""
 
 FOR_KERNELS = CONSTANTS | {

@@ -7,6 +7,9 @@ from typing import NamedTuple
 ALIKE = 0.025
 """Difference of colours that counts by its square as much as by itself."""
 
+_STEEPEST = 1e30
+"""1 / q of a q that any difference is beyond."""
+
 
 class Measure(NamedTuple):
     """How a drawn picture is compared with the true one.
@@ -22,3 +25,11 @@ class Measure(NamedTuple):
 
     ssim: float
     quadratic: float = 0.0
+
+    def bend(self) -> tuple[float, float, float]:
+        """Return 1 / q and q / 2, as kernels take them, and what their distances count.
+
+        Which are Huber's loss divided by q; with a q that any difference is beyond they are |d|.
+        """
+        q = self.quadratic
+        return (1 / q, q / 2, q / ALIKE) if q else (_STEEPEST, 0.0, 1.0)

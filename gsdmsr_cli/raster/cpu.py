@@ -130,7 +130,7 @@ class _Look(Function):
         loss = looking.look(
             *_arrays(stored), (degree + 1) ** 2, view, intrinsics,
             camera.centre.astype(np.float32), width, height, array(background.contiguous()),
-            array(target), float(measure.ssim), float(measure.quadratic), threads(),
+            array(target), float(measure.ssim), measure.bend(), threads(),
             array(tile_weights), array(errors), *_arrays(gradients), array(on_screen),
         )  # fmt: skip
         ctx.gradients = gradients

@@ -248,7 +248,7 @@ class _Look(Function):
             errors = losses.new_empty(views.number, 0)
         else:
             errors, sums = stages.blend_and_compare(
-                views, projected, bins, background, targets, tile_weights, measure.quadratic
+                views, projected, bins, background, targets, tile_weights, measure
             )
             weighted = errors if tile_weights is None else errors * tile_weights.view_as(errors)
             losses = weighted.sum(dim=1) / (3 * views.width * views.height)

@@ -39,8 +39,7 @@ def sources() -> list[Path]:
     """Return all files that kernels are compiled from: their own, and the constants."""
     ops = PACKAGE / "ops"
     kernels = [*ops.glob("*/cpu.py"), *ops.glob("*/cpu/*.py"), *HERE.glob("*.py")]
-    files = ("measure.py", "splatting_constants.py", "ssim.py")
-    constants = [PACKAGE / "ground" / name for name in files]
+    constants = [PACKAGE / "ground" / name for name in ("splatting_constants.py", "ssim.py")]
     return [*sorted(kernels), *constants]
 
 

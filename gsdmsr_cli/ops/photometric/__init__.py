@@ -61,7 +61,7 @@ class _Photometric(Function):
         gradient = torch.empty_like(planes)
         loss = kernels.compare(
             array(planes), array(target), height, width, float(measure.ssim),
-            float(measure.quadratic), array(gradient),
+            measure.bend(), array(gradient),
         )  # fmt: skip
         ctx.gradient = gradient[:, :height, :width].permute(1, 2, 0)
         return torch.tensor(loss, dtype=torch.float32)

@@ -13,7 +13,6 @@ from numba import float32, prange
 from gsdmsr_cli.backends.cpu import simd
 from gsdmsr_cli.backends.cpu.jit import inline, parallel, serial
 from gsdmsr_cli.ground import ssim
-from gsdmsr_cli.ground.measure import ALIKE
 
 STRIP = 32
 """Rows that one task handles at a time; its horizontal sums stay in cache."""
@@ -25,8 +24,6 @@ _MARGIN = _LANES
 WINDOW = ssim.WINDOW.astype(np.float32)
 _W0, _W1, _W2, _W3, _W4, _W5 = (float32(w) for w in WINDOW[: _REACH + 1])
 _SCALE = float32(1 / 255)
-_STEEPEST = float32(1e30)
-"""1 / q of a q that any difference is beyond."""
 
 
 @parallel
@@ -86,14 +83,6 @@ def load_target(pixels, at, inside, row):
     for x in range(_LANES):
         row[x] = float32(pixels[at + x]) if x < inside else float32(0)
     return simd.load(row, 0) * _SCALE
-
-
-@inline
-def bend(quadratic):
-    """Return what ``distances`` takes of a ``Measure``, and what its results are multiplied by."""
-    if quadratic > 0:
-        return float32(1 / quadratic), float32(quadratic / 2), quadratic / ALIKE
-    return _STEEPEST, float32(0), 1.0
 
 
 @inline
@@ -222,13 +211,19 @@ def ssim_gradient(drawn, target, height, width, maps, weight, gradient):
 
 
 @serial
-def compare(drawn, target, height, width, ssim_weight, quadratic, gradient):
-    """Return the loss of a ``Measure``, and write its gradient; arguments as in ``distance``."""
+def compare(drawn, target, height, width, ssim_weight, bend, gradient):
+    """Return the loss of a ``Measure``, and write its gradient; arguments as in ``distance``.
+
+    Args:
+        bend: see ``Measure.bend``.
+    """
     count = 3 * height * width
     sums = np.empty(3 * drawn.shape[1])
-    steep, half, unit = bend(quadratic)
+    steep, half, unit = bend
     weight = (1 - ssim_weight) * unit / count
-    distance(drawn, target, height, width, float32(weight), steep, half, gradient, sums)
+    distance(
+        drawn, target, height, width, float32(weight), float32(steep), float32(half), gradient, sums
+    )
     loss = weight * sums.sum()
     if ssim_weight > 0:
         wanted = np.empty_like(drawn)

@@ -69,7 +69,7 @@ import numpy as np
 from gsdmsr_cli.ops.photometric import cpu
 
 drawn, target = np.ones((3, 16, 16), np.float32), np.zeros((3, 16, 16), np.uint8)
-print(json.dumps(cpu.compare(drawn, target, 16, 16, 0.0, 0.0, np.empty_like(drawn))))
+print(json.dumps(cpu.compare(drawn, target, 16, 16, 0.0, (1e30, 0.0, 1.0), np.empty_like(drawn))))
 """
 
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from gsdmsr_cli.backends.cpu.jit import serial
 from gsdmsr_cli.ground.splatting_constants import TILE
-from gsdmsr_cli.ops.photometric.cpu import bend, compare
+from gsdmsr_cli.ops.photometric.cpu import compare
 from gsdmsr_cli.ops.rasterize.cpu.binning import assign, leave_out
 from gsdmsr_cli.ops.rasterize.cpu.blending import (
     PARTS,
@@ -27,7 +27,7 @@ from gsdmsr_cli.ops.rasterize.cpu.projection import project, project_backward
 @serial
 def look(
     means, quats, log_scales, logit_opacities, sh, axes, terms, view, intrinsics, centre,
-    width, height, background, target, ssim_weight, quadratic, threads, tile_weights, errors,
+    width, height, background, target, ssim_weight, bend, threads, tile_weights, errors,
     d_means, d_quats, d_log_scales, d_logit_opacities, d_sh, d_axes, on_screen,
 ):  # fmt: skip
     """Return the loss against ``target`` (3, H, W) uint8, and write its gradients.
@@ -62,16 +62,17 @@ def look(
         ends = np.empty(rows * columns, np.int32)
         blend(records, entries, starts, busiest, threads, columns, background, rgb, alpha, ends)
         d_rgb, d_alpha = np.empty_like(rgb), np.empty((0, 0), np.float32)
-        loss = compare(rgb, target, height, width, ssim_weight, quadratic, d_rgb)
+        loss = compare(rgb, target, height, width, ssim_weight, bend, d_rgb)
         blend_backward(
             records, entries, starts, busiest, ends, columns, rgb, alpha, d_rgb, d_alpha, sums
         )
     else:
         count = 3 * height * width
-        steep, half, unit = bend(quadratic)
+        steep, half, unit = bend
         blend_and_compare(
             records, entries, starts, busiest, columns, background, target,
-            np.float32(unit / count), steep, half, tile_weights, errors, sums,
+            np.float32(unit / count), np.float32(steep), np.float32(half), tile_weights, errors,
+            sums,
         )  # fmt: skip
         errors *= unit
         if tile_weights.shape[0] > 0:

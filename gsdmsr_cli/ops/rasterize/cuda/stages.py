@@ -18,7 +18,7 @@ from torch import Tensor
 from gsdmsr_cli.backends.cuda import recording
 from gsdmsr_cli.backends.cuda.compiler import MOST_VIEWS
 from gsdmsr_cli.backends.cuda.launch import blocks, launch, struct
-from gsdmsr_cli.ground.measure import ALIKE, Measure
+from gsdmsr_cli.ground.measure import Measure
 from gsdmsr_cli.ground.splatting_constants import TILE, tile_grid
 from gsdmsr_cli.ops.rasterize.cuda.room import Room
 from gsdmsr_cli.scene.camera import Camera
@@ -27,8 +27,6 @@ SUMS = 16
 """Floats for the sums of a splat, as in blending.cu."""
 
 _PIXELS = TILE * TILE
-_STEEPEST = 1e30
-"""1 / q of a q that any difference of colours is beyond."""
 _DIMENSIONS = {"means": 2, "quats": 2, "log_scales": 2, "logit_opacities": 1, "sh": 3, "axes": 3}
 """Of each stored tensor, when all views share it."""
 
@@ -317,7 +315,7 @@ def blend_and_compare(
     background: Tensor,
     targets: Sequence[Tensor],
     tile_weights: Tensor | None,
-    quadratic: float,
+    measure: Measure,
 ) -> tuple[Tensor, Tensor]:
     """Draw, compare by the mean distance of colours and differentiate, tile by tile.
 
@@ -326,7 +324,7 @@ def blend_and_compare(
         targets: (3, H, W) uint8 of each view.
         tile_weights: (V tiles,) factors on the share of each tile in the loss; those of weight 0
             are not drawn. None for 1 everywhere.
-        quadratic: see ``Measure``.
+        measure: how colours are compared.
 
     Returns:
         (V, tiles) float64, sums of the distances without these weights; and sums as
@@ -334,20 +332,13 @@ def blend_and_compare(
     """
     errors = background.new_empty(views.number, views.tiles, dtype=torch.float64)
     sums = background.new_zeros(len(projected[0]), SUMS)
-    steep, half, unit = _bend(quadratic)
+    steep, half, unit = measure.bend()
     launch(
         "blending", "blend_and_compare", (views.number * views.tiles, 1), _PIXELS,
         views.width, views.height, _drawn(projected, bins), background, _targets(views, targets),
         unit / (3 * views.width * views.height), steep, half, tile_weights, errors, sums,
     )  # fmt: skip
     return errors if unit == 1 else errors.mul_(unit), sums
-
-
-def _bend(quadratic: float) -> tuple[float, float, float]:
-    """Return what ``distance`` of common.cuh takes, and what its results are multiplied by."""
-    if quadratic == 0:
-        return _STEEPEST, 0.0, 1.0
-    return 1 / quadratic, quadratic / 2, quadratic / ALIKE
 
 
 def gather(shapes: Tensor, sums: Tensor, weighted: bool) -> tuple[Seen, Tensor]:
@@ -385,7 +376,7 @@ def compare(
     similar, distant = (rgb.new_empty(views.number, grid[0] * 3) for _ in range(2))
     launch("photometric", "ssim_maps", grid, _PIXELS, *given, maps, similar)
     count = 3 * views.width * views.height
-    steep, half, unit = _bend(measure.quadratic)
+    steep, half, unit = measure.bend()
     colours = (1 - measure.ssim) * unit
     launch(
         "photometric", "photometric_gradient", grid, _PIXELS,
