@@ -356,7 +356,8 @@ __device__ __forceinline__ void clear(float *sums, int count, bool now) {
 //
 // d_sh is written by the thread that owns it; the caller sets it to 0 before. d_shapes is that of
 // (A, B, C, L), d_paints that of (red, green, blue, depth). The kernels ask for 5 blocks on a
-// multiprocessor: that is 96 registers, and none spill from sm_75 to sm_120; unasked, ptxas takes 96 to 128.
+// multiprocessor: that is 96 registers, and none spill from sm_75 to sm_120, which hangs on the order:
+// with the shape before the paint, NVRTC 13.0 spills one. Unasked, ptxas takes 96 to 128.
 template <bool WITH_AXES>
 __device__ __forceinline__ void project_splat_backward(
     const Views &views, int view_count, int n, const Stored &s, const Own &own, int stored,
@@ -380,13 +381,13 @@ __device__ __forceinline__ void project_splat_backward(
             const float *mean = s.means + 3 * (own.means ? row : i);
             size_t sh_at = 3 * stored * (own.sh ? row : (size_t)i);
             Incoming in = {d_means2d[row], d_shapes[row], d_paints[row]};
+            paint_backward(
+                view, mean, s.sh + sh_at, terms, paints[row], in.paint, d_mean, d.sh + sh_at
+            );
             shape_backward<WITH_AXES>(
                 view, mean, first_of<WITH_AXES>(s, own, row, i),
                 second_of<WITH_AXES>(s, own, row, i), width, height, shapes[row], in, d_mean,
                 d_first, d_second
-            );
-            paint_backward(
-                view, mean, s.sh + sh_at, terms, paints[row], in.paint, d_mean, d.sh + sh_at
             );
             float logit = s.logit_opacities[own.logit_opacities ? row : i];
             d_logit[0] += LOG2E * in.shape.w / (1.0f + expf(logit));  // L = log2(sigmoid(logit))
