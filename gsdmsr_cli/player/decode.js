@@ -2,7 +2,7 @@
 
 const MAGIC = [0x64, 0x73, 0x70, 0x6c, 0x61, 0x74, 0x0d, 0x0a];
 const VERSION = 1;
-const MOST_ROWS = 1 << 24; // so that every row has a number that float32 holds
+export const MOST_ROWS = 1 << 24; // so that every row has a number that float32 holds
 
 /** What is wrong with a file, as a sentence for whoever has opened it. */
 export class FileError extends Error {}

@@ -35,17 +35,18 @@ export class Drawing {
     const { gl } = this;
     this.drop();
     const { header, parts, tables } = scene;
-    const { own: [offsets, turns, growths, opacities], colours } = curveCounts(parts);
+    const { own, colours } = curveCounts(parts);
     const moves = header.moving > 0;
     this.placing = this.program(placeShader({
       DEGREE: header.sh_degree, MOVING: header.moving, LIVES: tables.lives ? 1 : 0,
       NEIGHBOURS: tables.followed ? Math.max(1, header.bodies.neighbours) : 0,
-      OFFSETS: moves ? offsets : 0, TURNS: moves ? turns : 0, GROWTHS: moves ? growths : 0,
-      OPACITIES: moves ? opacities : 0, COLOURS: moves ? colours : 0,
+      OWN: moves ? own : 0, COLOURS: moves ? colours : 0,
     }), noFragments, Object.keys(PLACED));
     const formats = {
       geometry: gl.RGBA32F, rest: gl.RGBA16F, lives: gl.RGBA32F, followed: gl.RG32F,
-      own: gl.RGBA32F, colours: gl.RGBA16F, bodies: gl.RGBA32F, curves: gl.R32F,
+      own: gl.RGBA32F, own_ends: gl.RGBA32F, own_which: gl.R32F,
+      colours: gl.RGBA16F, colour_ends: gl.R32F, colour_which: gl.R32F,
+      bodies: gl.RGBA32F, curves: gl.R32F,
     };
     this.tables = Object.fromEntries(Object.entries(formats).map(([name, format]) => (
       [name, new Table(gl, format, tables[name])])));

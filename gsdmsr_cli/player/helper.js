@@ -17,6 +17,7 @@ export class Helper {
     this.sortMilliseconds = [];
     this.orders = 0;
     this.loaded = false;
+    this.fault = null; // why there are no orders any more
     this.current = null; // what the last order that came was for
     this.running = null;
     this.wanted = null; // asked for while another is on its way
@@ -39,6 +40,7 @@ export class Helper {
   async load(bytes) {
     const before = this.loaded;
     this.loaded = false;
+    this.fault = null;
     await this.running;
     try {
       const answer = await this.call({ bytes });
@@ -72,18 +74,20 @@ export class Helper {
       }
     } catch (error) {
       this.loaded = false;
+      this.fault = error;
       this.onFault(error);
     } finally {
       this.running = null;
     }
   }
 
-  /** Return when the last order is the one at a time along a direction. */
+  /** Return when the last order is the one at a time along a direction; fail where none can be had. */
   async exact(wanted) {
     while (this.loaded && !same(wanted, this.current)) {
       this.ask(wanted);
       await this.running;
     }
+    if (this.fault) throw this.fault;
   }
 }
 

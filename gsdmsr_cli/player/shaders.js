@@ -19,11 +19,12 @@ function head(defined = {}) {
 /**
  * Moves a splat, projects it and finds its colour; run once a splat, without drawing.
  *
- * counts has DEGREE, MOVING, NEIGHBOURS, LIVES, OFFSETS, TURNS, GROWTHS, OPACITIES, COLOURS.
+ * counts has DEGREE, MOVING, NEIGHBOURS, LIVES, OWN (curves of all kinds but colours), COLOURS.
  */
 export const placeShader = (counts) => `${head({ ...counts, TABLE_WIDTH })}
 layout(location = 0) in uint splat;
-uniform sampler2D geometry, rest, lives, followed, bodies, own, colours, curves;
+uniform sampler2D geometry, rest, lives, followed, bodies, curves;
+uniform sampler2D own, own_ends, own_which, colours, colour_ends, colour_which;
 uniform mat4 world_to_camera;
 uniform vec2 focal, middle, size;
 uniform vec3 eye;
@@ -33,7 +34,6 @@ out vec4 colour;
 out float depth;
 
 const int COEFFICIENTS = (DEGREE + 1) * (DEGREE + 1);
-const int OWN = OFFSETS + TURNS + GROWTHS + OPACITIES;
 
 vec4 texel(sampler2D table, int index) {
   return texelFetch(table, ivec2(index % TABLE_WIDTH, index / TABLE_WIDTH), 0);
@@ -68,9 +68,13 @@ void follow_bodies(int row, inout vec3 mean, inout vec4 quat, inout vec3 log_sca
   log_scales += growth.xyz;
 }
 
-vec4 sum_of_curves(int row, int first, int count) {
+float curve(sampler2D which, int entry) {
+  return texel(curves, int(texel(which, entry).x)).x;
+}
+
+vec4 sum_of_curves(int from, int end) {
   vec4 sum = vec4(0.0);
-  for (int r = first; r < first + count; r++) sum += texel(curves, r).x * texel(own, row * OWN + r);
+  for (int k = from; k < end; k++) sum += curve(own_which, k) * texel(own, k);
   return sum;
 }
 
@@ -84,12 +88,14 @@ float life(int row) {
 vec3 coefficient(int row, int k) {
   vec3 found = k == 0 ? texel(geometry, 4 * row + 3).xyz
     : texel(rest, row * (COEFFICIENTS - 1) + k - 1).xyz;
+#if COLOURS > 0
   if (row < MOVING) {
-    for (int r = 0; r < COLOURS; r++) {
-      vec3 share = texel(colours, (row * COLOURS + r) * COEFFICIENTS + k).xyz;
-      found += texel(curves, OWN + r).x * share;
+    int end = int(texel(colour_ends, row).x);
+    for (int n = row > 0 ? int(texel(colour_ends, row - 1).x) : 0; n < end; n++) {
+      found += curve(colour_which, n) * texel(colours, n * COEFFICIENTS + k).xyz;
     }
   }
+#endif
   return found;
 }
 
@@ -139,10 +145,13 @@ void main() {
 #if NEIGHBOURS > 0
     follow_bodies(row, mean, quat, log_scales);
 #endif
-    mean += sum_of_curves(row, 0, OFFSETS).xyz;
-    quat += sum_of_curves(row, OFFSETS, TURNS);
-    log_scales += sum_of_curves(row, OFFSETS + TURNS, GROWTHS).xyz;
-    opacity = clamp(opacity + sum_of_curves(row, OWN - OPACITIES, OPACITIES).x, 0.0, 1.0);
+#if OWN > 0
+    ivec4 ends = ivec4(texel(own_ends, row));
+    mean += sum_of_curves(row > 0 ? int(texel(own_ends, row - 1).w) : 0, ends.x).xyz;
+    quat += sum_of_curves(ends.x, ends.y);
+    log_scales += sum_of_curves(ends.y, ends.z).xyz;
+    opacity = clamp(opacity + sum_of_curves(ends.z, ends.w).x, 0.0, 1.0);
+#endif
 #if LIVES
     opacity *= life(row);
 #endif

@@ -5,6 +5,7 @@ import { depthsAt, Sorter } from "./sort.js";
 import { makeTables } from "./tables.js";
 
 const FOR_THE_PAGE = /^(points|curves\/.*|shares\/body\/.*)$/; // the page moves bodies itself
+const FOR_DEPTHS = /^(means|points|(curves|shares)\/(body\/.*|splat\/offset))$/;
 
 /** Answer the page's messages until it ends this worker. */
 export function work() {
@@ -15,9 +16,10 @@ export function work() {
     const begun = performance.now();
     const file = await decode(bytes);
     const tables = makeTables(file);
-    scene = { ...file, followed: tables.followed };
+    const partsFor = (names) => new Map([...file.parts].filter(([name]) => names.test(name)));
+    scene = { header: file.header, parts: partsFor(FOR_DEPTHS), followed: tables.followed };
     sorter = new Sorter(file.header.splats);
-    const parts = new Map([...file.parts].filter(([name]) => FOR_THE_PAGE.test(name)));
+    const parts = partsFor(FOR_THE_PAGE);
     const answer = { number, header: file.header, parts, tables, milliseconds: performance.now() - begun };
     const given = Object.entries(tables).filter(([name, table]) => table && name !== "followed");
     postMessage(answer, given.map(([, table]) => table.buffer));

@@ -299,6 +299,19 @@ def with_own_curves() -> File:
     return file
 
 
+def with_few_curves(kind: str, splats: int, curves: int) -> File:
+    """Return a scene in which each splat has a share of one of many curves of its own."""
+    file, rng = still(splats, 1, seed=7), np.random.default_rng(11)
+    file.moving, file.times = splats, 4
+    name, channels = f"splat/{kind}", {"offset": 3, "sh": 12}[kind]
+    with_curves(file, name, channels, 0.1, curves)
+    whole = rng.integers(0, 3, size=(splats, channels, 1))  # which is coded without rounding
+    there = np.arange(curves) == rng.integers(curves, size=(splats, 1, 1))
+    file.tables[f"shares/{name}"] = (whole * there).reshape(splats, -1)
+    file.tables[f"curves/{name}"] *= 0.1
+    return file
+
+
 def with_lives() -> File:
     """Return a scene in which splats appear and vanish, and some drift as well."""
     file, rng = with_own_curves(), np.random.default_rng(6)

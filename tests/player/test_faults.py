@@ -127,6 +127,37 @@ def test_a_browser_without_workers_gives_a_sentence(browser: Chromium, tmp_path:
     assert "worker" in told
 
 
+def of_a_card_with_rows(rows: int) -> str:
+    """Return a script by which textures of the graphics card have so many rows at most."""
+    return (
+        "const limit = WebGL2RenderingContext.prototype.getParameter;"
+        "WebGL2RenderingContext.prototype.getParameter = function (name) {"
+        f"  return name === this.MAX_TEXTURE_SIZE ? {rows} : limit.call(this, name);"
+        "};"
+    )
+
+
+def test_a_scene_that_the_graphics_card_cannot_hold_gives_a_sentence(
+    browser: Chromium, tmp_path: Path
+) -> None:
+    with Changed(browser, of_a_card_with_rows(1)):
+        told = sentence(browser, page(by_hand.still(2000).encode(), None, "many"), tmp_path)
+    assert "more splats than the graphics card" in told
+
+
+@pytest.mark.parametrize("kind", ["offset", "sh"])
+def test_curves_that_a_splat_has_no_share_of_take_no_room(
+    browser: Chromium, tmp_path: Path, kind: str
+) -> None:
+    """Splats of a capture hardly move, and have few of the many curves that what moves needs."""
+    file = by_hand.with_few_curves(kind, splats=500, curves=60)
+    rows = 4  # what is needed; all pairs of a splat and a curve would be 15 and 59
+    with Changed(browser, of_a_card_with_rows(rows)):
+        opened(browser, file, tmp_path)
+    (expected,) = drawn_by_reference(file, CAMERAS[0], 0.37, BLACK)
+    assert psnr(drawn_by_page(browser, CAMERAS[0], 0.37, BLACK), expected) >= 52
+
+
 def opened(browser: Chromium, file: File, folder: Path) -> None:
     path = folder / "page.html"
     path.write_text(page(file.encode(), None, "a scene"), encoding="utf-8")
