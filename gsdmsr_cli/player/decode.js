@@ -10,7 +10,9 @@ export class FileError extends Error {}
 /**
  * Return what a file holds: its header, and its parts by name.
  *
- * A part is {rows, columns, values}; values is a Float32Array of rows * columns, row by row.
+ * A part is {rows, columns, values}; values is a Float32Array of rows * columns, row by row. Shares of splats,
+ * most of which are 0, are {rows, columns, starts, places, values} of the others: those of row i are
+ * values[n], in column places[n], for n from starts[i] to starts[i + 1].
  */
 export async function decode(bytes) {
   const { header, start } = readHeader(bytes);
@@ -25,9 +27,9 @@ export async function decode(bytes) {
     }
     if (isKnown(entry.name)) {
       const planes = await inflate(bytes.subarray(at, end), entry);
-      const values = entry.name === "means" ? readMeans(planes, entry, header.moving)
-        : readTable(planes, entry);
-      parts.set(entry.name, { rows: entry.rows, columns: entry.columns, values });
+      const read = entry.name === "means" ? { values: readMeans(planes, entry, header.moving) }
+        : SPARSE.test(entry.name) ? readSparse(planes, entry) : { values: readTable(planes, entry) };
+      parts.set(entry.name, { rows: entry.rows, columns: entry.columns, ...read });
     }
     at = end;
   }
@@ -123,24 +125,58 @@ function readColumn(planes, { rows, width }, c, column) {
   }
 }
 
-function readTable(planes, entry) {
-  const { rows, columns, least, step, signed, difference } = entry;
-  const values = new Float32Array(rows * columns);
-  const column = new Float64Array(rows);
+/** Call take(c, values) for every column; the values are good until the next one. */
+function readColumns(planes, entry, take) {
+  const { name, rows, columns, least, step, signed, difference } = entry;
+  const codes = new Float64Array(rows);
+  const values = new Float32Array(rows);
   for (let c = 0; c < columns; c++) {
-    readColumn(planes, entry, c, column);
+    readColumn(planes, entry, c, codes);
     if (signed || difference) {
       for (let i = 0; i < rows; i++) {
-        column[i] = column[i] % 2 ? -(column[i] + 1) / 2 : column[i] / 2;
+        const half = Math.floor(codes[i] / 2);
+        codes[i] = codes[i] === 2 * half ? half : -half - 1;
       }
     }
-    if (difference) for (let i = 1; i < rows; i++) column[i] += column[i - 1];
+    if (difference) for (let i = 1; i < rows; i++) codes[i] += codes[i - 1];
     const base = least[c % least.length];
     const factor = step[c % step.length];
-    for (let i = 0; i < rows; i++) values[i * columns + c] = base + factor * column[i];
+    for (let i = 0; i < rows; i++) values[i] = base + factor * codes[i];
+    let none = 0; // becomes NaN where a value is not finite
+    for (let i = 0; i < rows; i++) none += 0 * values[i];
+    demand(none === 0, `${name} has values that are not finite`);
+    take(c, values);
   }
-  demand(values.every(Number.isFinite), `${entry.name} has values that are not finite`);
+}
+
+function readTable(planes, entry) {
+  const { rows, columns } = entry;
+  const values = new Float32Array(rows * columns);
+  readColumns(planes, entry, (c, column) => {
+    for (let i = 0; i < rows; i++) values[i * columns + c] = column[i];
+  });
   return values;
+}
+
+/** Return the values that are not 0, and where they are, see decode(). */
+function readSparse(planes, entry) {
+  const { rows } = entry;
+  const starts = new Uint32Array(rows + 1);
+  readColumns(planes, entry, (c, column) => {
+    for (let i = 0; i < rows; i++) if (column[i]) starts[i + 1]++;
+  });
+  for (let i = 0; i < rows; i++) starts[i + 1] += starts[i];
+  const next = starts.slice();
+  const places = new Uint32Array(starts[rows]);
+  const values = new Float32Array(starts[rows]);
+  readColumns(planes, entry, (c, column) => {
+    for (let i = 0; i < rows; i++) {
+      if (!column[i]) continue;
+      places[next[i]] = c;
+      values[next[i]++] = column[i];
+    }
+  });
+  return { starts, places, values };
 }
 
 /** Return the canonical centres, which are Morton codes in the file. */
@@ -186,6 +222,8 @@ export function channelsOf(header) {
 
 const SINGLE = ["means", "quats", "log_scales", "opacities", "sh_0", "sh_rest", "lives", "points",
   "log_radii", "body"];
+
+const SPARSE = /^shares\/splat\//;
 
 function isKnown(name) {
   const [kind, ...rest] = name.split("/");

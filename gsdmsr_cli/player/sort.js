@@ -15,8 +15,7 @@ export function depthsAt({ header, parts, followed }, time, [a, b, c], depths) {
   if (followed) addBodies(header, bodiesAt(parts, time), followed, means, [a, b, c], depths);
   const curves = parts.get("curves/splat/offset");
   if (curves && header.moving) {
-    const { values: shares } = parts.get("shares/splat/offset");
-    addOffsets(header.moving, curvesAt(curves, time), shares, [a, b, c], depths);
+    addOffsets(header.moving, curvesAt(curves, time), parts.get("shares/splat/offset"), [a, b, c], depths);
   }
 }
 
@@ -40,13 +39,11 @@ function addBodies({ moving, bodies }, moves, followed, means, [a, b, c], depths
   }
 }
 
-function addOffsets(moving, values, shares, [a, b, c], depths) {
-  const count = values.length;
-  for (let i = 0, row = 0; i < moving; i++, row += 3 * count) {
+function addOffsets(moving, curves, { starts, places, values }, direction, depths) {
+  const along = direction.flatMap((part) => Array.from(curves, (value) => part * value));
+  for (let i = 0; i < moving; i++) {
     let sum = 0;
-    for (let r = row; r < row + count; r++) {
-      sum += (a * shares[r] + b * shares[r + count] + c * shares[r + 2 * count]) * values[r - row];
-    }
+    for (let n = starts[i]; n < starts[i + 1]; n++) sum += along[places[n]] * values[n];
     depths[i] += sum;
   }
 }

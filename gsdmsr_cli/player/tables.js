@@ -75,70 +75,59 @@ function asTexels(triples) {
 /**
  * List the curves that splats have: those that they have a share of which is not 0.
  *
- * kinds are parts of shares, each with how many curves it is of and how many curves lie before them.
- * Returns which curve every entry of the list is, and for each splat where its entries of each kind end.
+ * kinds are parts of shares, each with how many curves it is of and how many curves lie before them. Returns for each
+ * splat where its entries of each kind end, for each entry which curve it is, and its `size` channels of shares.
  */
-function listCurves(kinds, moving) {
+function listShares(kinds, moving, size) {
   const ends = new Float32Array(kinds.length * moving);
-  let end = 0;
-  for (let i = 0, k = 0; i < moving; i++) {
-    for (const kind of kinds) {
-      for (let r = 0; r < kind.curves; r++) if (hasShare(kind, i, r)) end++;
-      ends[k++] = end;
+  const entries = new Int32Array(Math.max(...kinds.map(({ curves }) => curves)));
+  const walk = (take) => {
+    let end = 0;
+    entries.fill(-1);
+    for (let i = 0, k = 0; i < moving; i++) {
+      for (const { starts, places, values, curves, before } of kinds) {
+        const begin = end;
+        for (let n = starts[i]; n < starts[i + 1]; n++) {
+          const r = places[n] % curves;
+          if (entries[r] < begin) entries[r] = end++;
+          take(entries[r], before + r, (places[n] - r) / curves, values[n]);
+        }
+        ends[k++] = end;
+      }
     }
-  }
-  if (end > MOST_ROWS) throw new FileError("The scene moves in more ways than a page can show.");
-  const which = new Float32Array(end);
-  for (let i = 0, next = 0; i < moving; i++) {
-    for (const kind of kinds) {
-      for (let r = 0; r < kind.curves; r++) if (hasShare(kind, i, r)) which[next++] = kind.first + r;
-    }
-  }
-  return { ends, which };
-}
-
-/** Whether one channel or more of splat i has a share of curve r. */
-function hasShare({ columns, curves, values }, i, r) {
-  for (let c = r; c < columns; c += curves) if (values[columns * i + c] !== 0) return true;
-  return false;
+    return end;
+  };
+  const count = walk(() => {});
+  if (count > MOST_ROWS) throw new FileError("The scene moves in more ways than a page can show.");
+  const which = new Float32Array(count);
+  const shares = new Float32Array(size * count);
+  walk((entry, curve, channel, share) => {
+    which[entry] = curve;
+    shares[size * entry + channel] = share;
+  });
+  return { ends, which, shares };
 }
 
 /** A texel for each curve that a splat has, kind after kind: its share of up to four channels. */
 function ownShares(parts, moving) {
-  let first = 0;
+  const none = { starts: new Uint32Array(moving + 1) };
+  let before = 0;
   const kinds = OWN.map((name) => {
-    const { columns, values } = parts.get(`shares/${name}`) ?? { columns: 0, values: null };
     const curves = parts.get(`curves/${name}`)?.columns ?? 0;
-    first += curves;
-    return { columns, values, curves, first: first - curves };
+    const kind = { ...(parts.get(`shares/${name}`) ?? none), curves, before };
+    before += curves;
+    return kind;
   });
-  const { ends, which } = listCurves(kinds, moving);
-  const own = new Float32Array(4 * which.length);
-  for (let i = 0, k = 0, next = 0; i < moving; i++) {
-    for (const { columns, values, curves, first: before } of kinds) {
-      for (const end = ends[k++]; next < end; next++) {
-        const from = columns * i + which[next] - before;
-        for (let c = 0; c * curves < columns; c++) own[4 * next + c] = values[from + c * curves];
-      }
-    }
-  }
-  return { own, own_ends: ends, own_which: which };
+  const { ends, which, shares } = listShares(kinds, moving, 4);
+  return { own: shares, own_ends: ends, own_which: which };
 }
 
 /** A texel for each coefficient of each curve of colours that a splat has. */
 function colourShares(parts, { moving, sh_degree: degree }, before) {
-  const { columns, values } = parts.get("shares/splat/sh");
   const { columns: curves } = parts.get("curves/splat/sh");
-  const kind = { columns, values, curves, first: before };
-  const { ends, which } = listCurves([kind], moving);
-  const triples = new Float32Array(3 * (degree + 1) ** 2 * which.length);
-  for (let i = 0, next = 0, to = 0; i < moving; i++) {
-    for (; next < ends[i]; next++) {
-      const from = columns * i + which[next] - before;
-      for (let c = 0; c < columns; c += curves) triples[to++] = values[from + c];
-    }
-  }
-  return { colours: asTexels(toRgb(triples)), colour_ends: ends, colour_which: which };
+  const kind = { ...parts.get("shares/splat/sh"), curves, before };
+  const { ends, which, shares } = listShares([kind], moving, 3 * (degree + 1) ** 2);
+  return { colours: asTexels(toRgb(shares)), colour_ends: ends, colour_which: which };
 }
 
 /** Return the values at t of all curves that a splat may have of its own, in the tables' order. */
