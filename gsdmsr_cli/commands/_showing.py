@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from gsdmsr_cli import raster
 from gsdmsr_cli.drawing.judging import Judge
@@ -19,8 +20,9 @@ from gsdmsr_cli.options.preset import BACKGROUNDS
 from gsdmsr_cli.paths._around import common_up
 from gsdmsr_cli.runs.run import Run
 from gsdmsr_cli.scene.camera import Camera, look_at
+from gsdmsr_cli.scene.neighbours import neighbours
 from gsdmsr_cli.scene.pictures import Pictures
-from gsdmsr_cli.scene.scene import Scene
+from gsdmsr_cli.scene.scene import Scene, View
 
 VIEWS = 16
 """In which models are compared, evenly spaced in time."""
@@ -33,6 +35,12 @@ FRAMES_A_SECOND = 25
 
 LEAST_SECONDS = 2.0
 """A scene that is played lasts at least so long."""
+
+PLACES = 64
+"""Of a camera on its way that a player is told of, at most."""
+
+FILMED = 0.9
+"""Share of the views which have a neighbour in time, from which on one camera has filmed them."""
 
 
 def read_data(run: Run, data: Path | None) -> Scene | None:
@@ -91,19 +99,34 @@ def scene_facts(run: Run, model: Model, scene: Scene | None) -> dict[str, Any]:
         cameras = [view.camera for view in scene.split("train")]
     duration = None if scene is None else scene.duration
     seconds = duration or max(run.facts.frames / FRAMES_A_SECOND, LEAST_SECONDS)
-    return {
+    means = model.splats.means.detach().double().cpu().numpy()
+    first = cameras[0]
+    facts = {
         "bound": run.facts.bound,
         "up": common_up(cameras).tolist(),
         "background": list(BACKGROUNDS[run.preset.data.background]),
         "seconds": seconds,
-        "view": _view(cameras, model),
+        "view": _placed(first, means) | {"fov_y": 2 * math.atan(first.height / 2 / first.fy)},
     }
+    way = [] if scene is None else way_of_the_camera(scene.split("train"))
+    if way:
+        facts["path"] = [{"time": view.time} | _placed(view.camera, means) for view in way]
+    return facts
 
 
-def _view(cameras: Sequence[Camera], model: Model) -> dict[str, Any]:
-    """Return the first camera, and what it looks at: as far away as most of what it sees."""
-    camera = cameras[0]
-    means = model.splats.means.detach().double().cpu().numpy()
+def way_of_the_camera(views: Sequence[View]) -> list[View]:
+    """Return some of the views, in the order of time, if one moving camera has filmed them all."""
+    ordered = sorted(views, key=lambda view: view.time)
+    if len({view.time for view in ordered}) < max(len(ordered), 2):
+        return []
+    if sum(map(bool, neighbours(ordered).values())) < FILMED * len(ordered):
+        return []
+    rows = np.linspace(0, len(ordered) - 1, min(len(ordered), PLACES)).round().astype(int)
+    return [ordered[row] for row in rows]
+
+
+def _placed(camera: Camera, means: NDArray[np.float64]) -> dict[str, Any]:
+    """Return where a camera is, and what it looks at: as far away as most of what it sees."""
     depths = means @ camera.rotation[2] + camera.translation[2]
     depths = depths[depths > 0]
     distance = float(np.median(depths)) if len(depths) else 1.0
@@ -111,5 +134,4 @@ def _view(cameras: Sequence[Camera], model: Model) -> dict[str, Any]:
         "position": camera.centre.tolist(),
         "target": (camera.centre + distance * camera.rotation[2]).tolist(),
         "up": (-camera.rotation[1]).tolist(),
-        "fov_y": 2 * math.atan(camera.height / 2 / camera.fy),
     }

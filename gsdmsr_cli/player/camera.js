@@ -1,4 +1,4 @@
-// A camera that looks at a target: orbit, pan, zoom, fly, and ways from one place to another.
+// A camera that looks at a target: orbit, pan, zoom, fly, ways from one place to another, and a path in time.
 
 import { add, between, cross, dot, fromColumns, mix, product, subtract, times, turnAbout, turned,
   unit } from "./vectors.js";
@@ -15,6 +15,7 @@ export class Camera {
     this.fovY = 0.7;
     this.up = [0, 0, 1];
     this.way = null;
+    this.path = null; // places in time that it goes along until somebody moves it
   }
 
   get right() { return turned(this.turn, [1, 0, 0]); }
@@ -34,17 +35,29 @@ export class Camera {
     this.target = vector(view.target) ?? [0, 0, 0];
     const aside = Math.abs(this.up[0]) < 0.9 ? [1, 0, 0] : [0, 1, 0];
     const front = add(times(2.5 * bound, unit(cross(this.up, aside))), times(bound, this.up));
-    this.face(vector(view.position) ?? add(this.target, front), vector(view.up) ?? this.up);
+    const position = vector(view.position) ?? add(this.target, front);
+    Object.assign(this, facing(position, this.target, vector(view.up) ?? this.up));
     this.way = null;
+    this.path = pathOf(scene?.path, this.up);
   }
 
-  /** Look at the target from a place. */
-  face(position, up) {
-    const way = subtract(this.target, position);
-    const ahead = unit(way) ?? [0, 1, 0];
-    const right = unit(cross(ahead, up)) ?? unit(cross(ahead, [0.6, 0.64, 0.48]));
-    this.distance = Math.max(Math.hypot(...way), 1e-3);
-    this.turn = fromColumns(right, cross(ahead, right), ahead);
+  /** Go where the path is at a time, if it has one that nobody has left. */
+  follow(time) {
+    if (!this.path) return;
+    const last = this.path.length - 2;
+    const found = this.path.findIndex((place) => place.time > time) - 1;
+    const i = found < -1 ? last : Math.min(Math.max(found, 0), last);
+    const [a, b] = [this.path[i], this.path[i + 1]];
+    const f = Math.min(1, Math.max(0, (time - a.time) / (b.time - a.time)));
+    this.turn = between(a.turn, b.turn, f);
+    this.distance = a.distance + f * (b.distance - a.distance);
+    this.target = add(mix(a.position, b.position, f), times(this.distance, this.ahead));
+  }
+
+  /** Leave ways and paths: somebody moves the camera. */
+  free() {
+    this.way = null;
+    this.path = null;
   }
 
   /** Turn about the target, by angles [rad]. */
@@ -54,31 +67,32 @@ export class Camera {
     const lowest = Math.min(0, steepness + STEEPEST - Math.PI);
     const tilt = turnAbout(this.right, Math.min(highest, Math.max(lowest, upwards)));
     this.turn = unit(product(turnAbout(this.up, sideways), product(tilt, this.turn)));
-    this.way = null;
+    this.free();
   }
 
   /** Move sideways, so that what is as far away as the target follows a pointer [px]. */
   pan(x, y, focal) {
     const step = this.distance / focal;
     this.target = subtract(this.target, add(times(step * x, this.right), times(step * y, this.down)));
-    this.way = null;
+    this.free();
   }
 
   /** Come nearer to the target, or go away from it. */
   zoom(factor) {
     this.distance = Math.min(1e4, Math.max(1e-3, this.distance * factor));
-    this.way = null;
+    this.free();
   }
 
   /** Fly with the target ahead, by a way in the camera's axes. */
   fly(way) {
     this.target = add(this.target, turned(this.turn, way));
-    this.way = null;
+    this.free();
   }
 
   /** Begin to go to where something else is looked at; at once if `jump`. */
   go(to, jump = false) {
     const { target, distance, turn } = this;
+    this.path = null;
     this.way = { from: { target, distance, turn }, to: { target, distance, turn, ...to }, done: 0 };
     if (jump) this.advance(SECONDS);
   }
@@ -117,6 +131,24 @@ export class Camera {
       fx: focal, fy: focal, cx: width / 2, cy: height / 2, width, height,
     };
   }
+}
+
+/** Return how far from a place a target is, and how a camera is turned that looks at it. */
+function facing(position, target, up) {
+  const way = subtract(target, position);
+  const ahead = unit(way) ?? [0, 1, 0];
+  const right = unit(cross(ahead, up)) ?? unit(cross(ahead, [0.6, 0.64, 0.48]));
+  const distance = Math.max(Math.hypot(...way), 1e-3);
+  return { distance, turn: fromColumns(right, cross(ahead, right), ahead) };
+}
+
+/** Return the places of a path as a file's header gives them, null where there is none that can be used. */
+function pathOf(given, up) {
+  const known = (one, i) => Number.isFinite(one?.time) && vector(one.position) && vector(one.target)
+    && (i === 0 || one.time > given[i - 1].time);
+  if (!Array.isArray(given) || given.length < 2 || !given.every(known)) return null;
+  return given.map(({ time, position, target, up: own }) => (
+    { time, position, ...facing(position, target, vector(own) ?? up) }));
 }
 
 function vector(given) {

@@ -123,14 +123,17 @@ export function isTyping(event) {
 
 export const hasModifier = (event) => event.ctrlKey || event.metaKey || event.altKey;
 
-/** Let the camera go back to where it began. */
+/** Let the camera go back to where it began, or to its path: there at once, since time may go on. */
 export function resetView(player) {
   const { camera } = player;
   const { target, distance, turn } = camera;
   camera.start(player.header?.scene);
-  const there = { target: camera.target, distance: camera.distance, turn: camera.turn };
-  Object.assign(camera, { target, distance, turn });
-  camera.go(there, reducedMotion());
+  camera.follow(player.time);
+  if (!camera.path) {
+    const there = { target: camera.target, distance: camera.distance, turn: camera.turn };
+    Object.assign(camera, { target, distance, turn });
+    camera.go(there, reducedMotion());
+  }
   player.fixed = null;
   player.invalidate();
 }

@@ -51,7 +51,10 @@ export class Player {
 
   async take(bytes) {
     const scene = await this.helper.load(bytes);
-    if (!this.scene) this.camera.start(scene.header.scene);
+    if (!this.scene) {
+      this.camera.start(scene.header.scene);
+      this.camera.follow(this.time);
+    }
     this.bytes = bytes;
     this.coming = scene;
     await this.settle();
@@ -141,8 +144,14 @@ export class Player {
   play(seconds) {
     const time = this.time + seconds * this.speed / this.seconds;
     if (time > 1 && !this.loop) this.playing = false;
-    this.time = time <= 1 ? time : this.loop ? time % 1 : 1;
+    this.goTo(time <= 1 ? time : this.loop ? time % 1 : 1);
     this.onChange();
+  }
+
+  /** Let it be a time; a camera that has a path goes with it. */
+  goTo(time) {
+    this.time = time;
+    this.camera.follow(time);
   }
 
   paint(view) {
@@ -174,7 +183,7 @@ export class Player {
   }
 
   setTime(time) {
-    this.time = Math.min(1, Math.max(0, Number(time) || 0));
+    this.goTo(Math.min(1, Math.max(0, Number(time) || 0)));
     this.playing = false;
     this.changed();
   }
@@ -182,7 +191,7 @@ export class Player {
   /** Begin or end playing; from the end it begins anew. */
   setPlaying(playing) {
     this.playing = playing && this.moves;
-    if (this.playing && this.time >= 1) this.time = 0;
+    if (this.playing && this.time >= 1) this.goTo(0);
     this.changed();
   }
 

@@ -85,6 +85,50 @@ def test_it_begins_with_the_view_of_the_file(browser: Chromium, scene: Path) -> 
     assert focal == pytest.approx(350 / np.tan(0.35))  # the angle is that of the shorter side
 
 
+PATH = [
+    {"time": 0.0, "position": [0, -4, 1], "target": [0, 0, 0], "up": [0, 0, 1]},
+    {"time": 0.5, "position": [3, -4, 1], "target": [3, 0, 0], "up": [0, 0, 1]},
+    {"time": 1.0, "position": [3, -2, 1], "target": [3, 2, 0], "up": [0, 0, 1]},
+]
+
+
+def along(folder: Path, path: object) -> Path:
+    """Return a page whose file tells of the way of the camera that has filmed it."""
+    file = by_hand.with_bodies(24, 8)
+    file.header = {"scene": by_hand.SCENE | {"path": path}}
+    (folder / "path.html").write_text(page(file.encode(), None, "a scene"), encoding="utf-8")
+    return folder / "path.html"
+
+
+def test_the_camera_goes_along_its_path_until_somebody_moves_it(
+    browser: Chromium, tmp_path: Path
+) -> None:
+    begin(browser, along(tmp_path, PATH))
+    for moment, place in (
+        (0.0, [0, -4, 1]),
+        (0.25, [1.5, -4, 1]),
+        (0.9, [3, -2.4, 1]),
+        (1, [3, -2, 1]),
+    ):
+        browser.evaluate(f"dsplat.setTime({moment})")
+        np.testing.assert_allclose(centre(pose(browser)), place, atol=1e-6)
+    drag(browser, (40, 0))
+    left = centre(pose(browser))
+    browser.evaluate("dsplat.setTime(0.25)")
+    np.testing.assert_allclose(centre(pose(browser)), left, atol=1e-6)
+    key(browser, "r", "KeyR")
+    np.testing.assert_allclose(centre(pose(browser)), [1.5, -4, 1], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "path", [None, [], PATH[:1], PATH[::-1], [*PATH, {"time": 2}], [*PATH, None], "far"]
+)
+def test_a_path_that_is_none_is_left_out(browser: Chromium, tmp_path: Path, path: object) -> None:
+    begin(browser, along(tmp_path, path))
+    browser.evaluate("dsplat.setTime(0.7)")
+    np.testing.assert_allclose(centre(pose(browser)), [0, -4, 1], atol=1e-6)
+
+
 def test_dragging_turns_about_the_target_and_not_over_the_top(
     browser: Chromium, scene: Path
 ) -> None:
