@@ -106,7 +106,11 @@ def scene_facts(run: Run, model: Model, scene: Scene | None) -> dict[str, Any]:
         "up": common_up(cameras).tolist(),
         "background": list(BACKGROUNDS[run.preset.data.background]),
         "seconds": seconds,
-        "view": _placed(first, means) | {"fov_y": 2 * math.atan(first.height / 2 / first.fy)},
+        "view": _placed(first, means)
+        | {
+            "fov_x": 2 * math.atan(first.width / 2 / first.fx),
+            "fov_y": 2 * math.atan(first.height / 2 / first.fy),
+        },
     }
     way = [] if scene is None else way_of_the_camera(scene.split("train"))
     if way:

@@ -12,7 +12,8 @@ export class Camera {
     this.target = [0, 0, 0];
     this.distance = 4;
     this.turn = [1, 0, 0, 0];
-    this.fovY = 0.7;
+    this.fovY = 0.7; // of a canvas that is wider than high
+    this.fovX = 0.7; // of the others
     this.up = [0, 0, 1];
     this.way = null;
     this.path = null; // places in time that it goes along until somebody moves it
@@ -31,7 +32,8 @@ export class Camera {
     const bound = scene?.bound > 0 ? scene.bound : 1.3;
     const view = scene?.view ?? {};
     this.up = unit(vector(scene?.up) ?? [0, 0, 1]) ?? [0, 0, 1];
-    this.fovY = view.fov_y > 0 && view.fov_y < 3 ? view.fov_y : 0.7;
+    this.fovY = angle(view.fov_y) ?? 0.7;
+    this.fovX = Math.min(angle(view.fov_x) ?? this.fovY, this.fovY);
     this.target = vector(view.target) ?? [0, 0, 0];
     const aside = Math.abs(this.up[0]) < 0.9 ? [1, 0, 0] : [0, 1, 0];
     const front = add(times(2.5 * bound, unit(cross(this.up, aside))), times(bound, this.up));
@@ -118,7 +120,7 @@ export class Camera {
 
   /** Return the focal length [px] for a canvas: the angle of view is that of its shorter side. */
   focal(width, height) {
-    return Math.min(width, height) / 2 / Math.tan(this.fovY / 2);
+    return Math.min(width, height) / 2 / Math.tan((width < height ? this.fovX : this.fovY) / 2);
   }
 
   /** Return what the drawing needs to know: a rigid transform, row by row, and intrinsics [px]. */
@@ -150,6 +152,8 @@ function pathOf(given, up) {
   return given.map(({ time, position, target, up: own }) => (
     { time, position, ...facing(position, target, vector(own) ?? up) }));
 }
+
+const angle = (given) => (given > 0 && given < 3 ? given : null);
 
 function vector(given) {
   return Array.isArray(given) && given.length === 3 && given.every(Number.isFinite) ? given : null;

@@ -85,6 +85,20 @@ def test_it_begins_with_the_view_of_the_file(browser: Chromium, scene: Path) -> 
     assert focal == pytest.approx(350 / np.tan(0.35))  # the angle is that of the shorter side
 
 
+@pytest.mark.parametrize(
+    ("width", "angle"), [(700, 0.4), (1200, 0.7)], ids=["higher than wide", "wider than high"]
+)
+def test_what_was_filmed_upright_fills_a_screen_that_is_so(
+    browser: Chromium, tmp_path: Path, width: int, angle: float
+) -> None:
+    file = by_hand.with_bodies(24, 8)
+    file.header = {"scene": by_hand.SCENE | {"view": {"fov_x": 0.4, "fov_y": 0.7}}}
+    (tmp_path / "upright.html").write_text(page(file.encode(), None, "upright"), encoding="utf-8")
+    begin(browser, tmp_path / "upright.html", width)
+    focal = browser.evaluate("dsplat.view().fy")
+    assert focal == pytest.approx(min(width, 900) / 2 / np.tan(angle / 2))
+
+
 PATH = [
     {"time": 0.0, "position": [0, -4, 1], "target": [0, 0, 0], "up": [0, 0, 1]},
     {"time": 0.5, "position": [3, -4, 1], "target": [3, 0, 0], "up": [0, 0, 1]},
