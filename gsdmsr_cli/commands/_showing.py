@@ -119,7 +119,7 @@ def scene_facts(run: Run, model: Model, scene: Scene | None) -> dict[str, Any]:
 
 
 def way_of_the_camera(views: Sequence[View]) -> list[View]:
-    """Return some of the views, in the order of time, if one moving camera has filmed them all."""
+    """Return some of the views in the order of time, if one camera has filmed all on its way."""
     ordered = sorted(views, key=lambda view: view.time)
     if len({view.time for view in ordered}) < max(len(ordered), 2):
         return []

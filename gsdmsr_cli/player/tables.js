@@ -12,7 +12,7 @@ export function curveCounts(parts) {
   return { own: OWN.map(count).reduce((sum, more) => sum + more), colours: count("splat/sh") };
 }
 
-/** Return the tables of a decoded file by name; those that it does not need are null. */
+/** Return the tables of a decoded file by name; those that it does not need are null, or not there. */
 export function makeTables(file) {
   const { header, parts } = file;
   const { own, colours } = curveCounts(parts);
