@@ -94,9 +94,8 @@ def _circle(bound: float) -> list[Camera]:
 
 def scene_facts(run: Run, model: Model, scene: Scene | None) -> dict[str, Any]:
     """Return what a player is told of a scene, see docs/file-format.md."""
-    cameras = _circle(run.facts.bound)
-    if scene is not None:
-        cameras = [view.camera for view in scene.split("train")]
+    views = [] if scene is None else scene.split("train")
+    cameras = [view.camera for view in views] or _circle(run.facts.bound)
     duration = None if scene is None else scene.duration
     seconds = duration or max(run.facts.frames / FRAMES_A_SECOND, LEAST_SECONDS)
     means = model.splats.means.detach().double().cpu().numpy()
@@ -112,8 +111,7 @@ def scene_facts(run: Run, model: Model, scene: Scene | None) -> dict[str, Any]:
             "fov_y": 2 * math.atan(first.height / 2 / first.fy),
         },
     }
-    way = [] if scene is None else way_of_the_camera(scene.split("train"))
-    if way:
+    if way := way_of_the_camera(views):
         facts["path"] = [{"time": view.time} | _placed(view.camera, means) for view in way]
     return facts
 

@@ -85,16 +85,22 @@ def test_it_begins_with_the_view_of_the_file(browser: Chromium, scene: Path) -> 
     assert focal == pytest.approx(350 / np.tan(0.35))  # the angle is that of the shorter side
 
 
+def told(folder: Path, **scene: object) -> Path:
+    """Return a page whose file tells more, or something else, of its scene."""
+    file = by_hand.with_bodies(24, 8)
+    file.header = {"scene": by_hand.SCENE | scene}
+    path = folder / "told.html"
+    path.write_text(page(file.encode(), None, "a scene"), encoding="utf-8")
+    return path
+
+
 @pytest.mark.parametrize(
     ("width", "angle"), [(700, 0.4), (1200, 0.7)], ids=["higher than wide", "wider than high"]
 )
 def test_what_was_filmed_upright_fills_a_screen_that_is_so(
     browser: Chromium, tmp_path: Path, width: int, angle: float
 ) -> None:
-    file = by_hand.with_bodies(24, 8)
-    file.header = {"scene": by_hand.SCENE | {"view": {"fov_x": 0.4, "fov_y": 0.7}}}
-    (tmp_path / "upright.html").write_text(page(file.encode(), None, "upright"), encoding="utf-8")
-    begin(browser, tmp_path / "upright.html", width)
+    begin(browser, told(tmp_path, view={"fov_x": 0.4, "fov_y": 0.7}), width)
     focal = browser.evaluate("dsplat.view().fy")
     assert focal == pytest.approx(min(width, 900) / 2 / np.tan(angle / 2))
 
@@ -106,18 +112,10 @@ PATH = [
 ]
 
 
-def along(folder: Path, path: object) -> Path:
-    """Return a page whose file tells of the way of the camera that has filmed it."""
-    file = by_hand.with_bodies(24, 8)
-    file.header = {"scene": by_hand.SCENE | {"path": path}}
-    (folder / "path.html").write_text(page(file.encode(), None, "a scene"), encoding="utf-8")
-    return folder / "path.html"
-
-
 def test_the_camera_goes_along_its_path_until_somebody_moves_it(
     browser: Chromium, tmp_path: Path
 ) -> None:
-    begin(browser, along(tmp_path, PATH))
+    begin(browser, told(tmp_path, path=PATH))
     for moment, place in (
         (0.0, [0, -4, 1]),
         (0.25, [1.5, -4, 1]),
@@ -138,7 +136,7 @@ def test_the_camera_goes_along_its_path_until_somebody_moves_it(
     "path", [None, [], PATH[:1], PATH[::-1], [*PATH, {"time": 2}], [*PATH, None], "far"]
 )
 def test_a_path_that_is_none_is_left_out(browser: Chromium, tmp_path: Path, path: object) -> None:
-    begin(browser, along(tmp_path, path))
+    begin(browser, told(tmp_path, path=path))
     browser.evaluate("dsplat.setTime(0.7)")
     np.testing.assert_allclose(centre(pose(browser)), [0, -4, 1], atol=1e-6)
 
