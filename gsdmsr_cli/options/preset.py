@@ -73,6 +73,9 @@ class SplatOptions:
             of the train views overlap, "surfaces" where neighbouring train views agree.
         start_around: the same where train cameras stand around what they see, which
             ``scene.around`` decides; null makes no difference.
+        moving_share: share of these, 0 to 1, that lie on what moves, at the times at which it is
+            there, which cameras that stand still tell by their medians over time, see
+            ``training.starting.changing``.
         of_run: folder of a run whose canonical splats are taken as they are in place of all that;
             null takes none.
         opacity: their opacity, between 0 and 1.
@@ -83,6 +86,7 @@ class SplatOptions:
     count: int = 2500
     start: Literal["box", "silhouettes", "surfaces"] = "silhouettes"
     start_around: Literal["box", "silhouettes", "surfaces"] | None = None
+    moving_share: float = 0.0
     of_run: str | None = None
     opacity: float = 0.1
     sh_degree: int = 1
@@ -90,6 +94,7 @@ class SplatOptions:
 
     def __post_init__(self) -> None:
         require_at_least(self, 1, "count")
+        require(self, "moving_share", 0.0 <= self.moving_share <= 1.0, "0 to 1")
         require(self, "opacity", 0.0 < self.opacity < 1.0, "a number between 0 and 1, neither")
         require(self, "sh_degree", 0 <= self.sh_degree <= 3, "0 to 3")
         require_progress(self, "sh_start")

@@ -222,6 +222,7 @@ def test_values_that_are_no_options_are_refused(value: str) -> None:
         "data.cache_mib=-1",
         "splats.count=0",
         "splats.opacity=1",
+        "splats.moving_share=1.5",
         "splats.sh_degree=4",
         "splats.sh_start=1.1",
         "training.steps=0",

@@ -19,7 +19,7 @@ from gsdmsr_cli.runs.run import open_with_model
 from gsdmsr_cli.scene.around import cameras_stand_around
 from gsdmsr_cli.scene.pictures import Pictures
 from gsdmsr_cli.scene.scene import Scene
-from gsdmsr_cli.training.starting import silhouettes, surfaces
+from gsdmsr_cli.training.starting import changing, silhouettes, surfaces
 from gsdmsr_cli.training.starting.sightings import Points, at_unknown_times, colours_of
 
 NEIGHBOURS = 3
@@ -44,8 +44,9 @@ def initial_splats(
     They sit at the scene's own points, or at ``most`` of them chosen at random. Where there are
     none, or the start is "surfaces" and there are fewer than ``options.count``, others join them as
     ``options.start`` and ``options.start_around`` say: at random in the box and nearly grey, as all
-    methods do on D-NeRF; where silhouettes overlap; or on surfaces. Those of the run
-    ``options.of_run`` stand in place of all these, as they are.
+    methods do on D-NeRF; where silhouettes overlap; or on surfaces. A share of them lies on what
+    moves, if ``options.moving_share`` says so. Those of the run ``options.of_run`` stand in place
+    of all these, as they are.
 
     Raises:
         DataError: that run cannot be used.
@@ -55,10 +56,9 @@ def initial_splats(
         return splats, torch.full((len(splats),), math.nan)
     given = _given_points(scene, pictures, most, generator)
     wanted = min(options.count, most) - len(given.means)
-    start = _start(scene, options)
-    if not len(given.means) or (start == "surfaces" and wanted > 0):
-        more = _new_points(scene, start, wanted, pictures, background, generator)
-        given = Points(*map(torch.cat, zip(given, more, strict=True)))
+    if not len(given.means) or (_start(scene, options) == "surfaces" and wanted > 0):
+        more = _new_points(scene, options, wanted, pictures, background, generator)
+        given = _joined(given, more)
     means, colours, times = given
     n = len(means)
     sh = torch.zeros(n, (options.sh_degree + 1) ** 2, 3)
@@ -73,6 +73,10 @@ def initial_splats(
         sh=sh,
     )
     return splats, times
+
+
+def _joined(some: Points, others: Points) -> Points:
+    return Points(*map(torch.cat, zip(some, others, strict=True)))
 
 
 def of_run(folder: Path, sh_degree: int) -> Splats:
@@ -112,12 +116,33 @@ def _given_points(
 
 def _new_points(
     scene: Scene,
-    start: str,
+    options: SplatOptions,
     count: int,
     pictures: Pictures,
     background: Tensor,
     generator: torch.Generator,
 ) -> Points:
+    """Return points that the scene does not bring: a share on what moves, the others anywhere."""
+    moving = round(options.moving_share * count)
+    if not moving:
+        return _points_anywhere(scene, options, count, pictures, background, generator)
+    found = changing.sample_points(scene, pictures, moving, generator)
+    left = count - len(found.means)
+    if not left:
+        return found
+    others = _points_anywhere(scene, options, left, pictures, background, generator)
+    return _joined(found, others)
+
+
+def _points_anywhere(
+    scene: Scene,
+    options: SplatOptions,
+    count: int,
+    pictures: Pictures,
+    background: Tensor,
+    generator: torch.Generator,
+) -> Points:
+    start = _start(scene, options)
     if start == "silhouettes":
         return silhouettes.sample_points(scene, pictures, background, count, generator)
     if start == "surfaces":

@@ -10,7 +10,7 @@ from torch import Tensor
 from gsdmsr_cli.scene.camera import Camera
 from gsdmsr_cli.scene.pictures import Pictures
 from gsdmsr_cli.scene.scene import Scene
-from gsdmsr_cli.training.starting.sightings import places
+from gsdmsr_cli.training.starting.sightings import coarse_places
 
 DIFFERENCE = 8
 """A pixel belongs to the silhouette if a channel differs this much from the background [1/255]."""
@@ -40,10 +40,7 @@ class Outline:
 
     def cells(self, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return rows and columns of points (P, 3) in the coarse picture, and which it shows."""
-        across, down, visible = places(points, self.camera)
-        column = (across / self.stride).long().clamp(0, self.drawn.shape[1] - 1)
-        row = (down / self.stride).long().clamp(0, self.drawn.shape[0] - 1)
-        return row, column, visible
+        return coarse_places(points, self.camera, self.stride)
 
 
 def outlines(scene: Scene, pictures: Pictures, background: Tensor) -> Iterator[Outline]:

@@ -45,6 +45,17 @@ def places(points: Tensor, camera: Camera) -> tuple[Tensor, Tensor, Tensor]:
     return column, row, (at[:, 2] > 0) & across & (row >= 0) & (row < camera.height)
 
 
+def coarse_places(points: Tensor, camera: Camera, stride: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Return rows and columns (P,) of points (P, 3) in every ``stride``-th pixel, and who is shown.
+
+    Of points that the picture does not show, rows and columns are of some pixel.
+    """
+    across, down, shown = places(points, camera)
+    column = (across / stride).long().clamp(0, (camera.width - 1) // stride)
+    row = (down / stride).long().clamp(0, (camera.height - 1) // stride)
+    return row, column, shown
+
+
 def colours_of(points: Tensor, scene: Scene, pictures: Pictures) -> Tensor:
     """Return the mean colour of the pixels that points (P, 3) fall on, (P, 3) in [0, 1].
 
