@@ -15,7 +15,13 @@ from torch import Tensor
 from gsdmsr_cli.scene.camera import Camera
 from gsdmsr_cli.scene.pictures import Pictures
 from gsdmsr_cli.scene.scene import Scene, View
-from gsdmsr_cli.training.starting.sightings import Points, at_unknown_times, coarse_places
+from gsdmsr_cli.training.starting.sightings import (
+    Points,
+    at_unknown_times,
+    coarse_picture,
+    coarse_places,
+    spread,
+)
 
 DIFFERENCE = 24
 """A pixel differs if a channel does so this much [1/255]: more than noise and faint shadows do."""
@@ -34,6 +40,8 @@ CAMERAS = 4
 
 SHARE = 0.75
 """Share of them for which it must differ: others may have something of its colour behind it."""
+
+_NONE = at_unknown_times(torch.zeros(0, 3), torch.zeros(0, 3))
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +90,9 @@ def sample_points(
         generator: source of the random points.
     """
     times = scene.train_times[:: -(-len(scene.train_times) // LOOKED_AT)]
-    watches = _watches(scene, pictures, times)
+    watches = _watches(scene, pictures, times) if count else []
+    if not watches:  # nothing is drawn at random, so all else is as if it had not been tried
+        return _NONE
     candidates = (2 * torch.rand(CANDIDATES, 3, generator=generator) - 1) * scene.bound
     shown, differs = torch.zeros(2, len(times), CANDIDATES, dtype=torch.int16)
     for watch in watches:
@@ -91,7 +101,7 @@ def sample_points(
         differs[watch.moments] += visible & watch.changed[:, row, column]
     moments, rows = torch.nonzero((shown >= CAMERAS) & (differs >= SHARE * shown), as_tuple=True)
     if not len(rows):
-        return at_unknown_times(torch.zeros(0, 3), torch.zeros(0, 3))
+        return _NONE
     chosen = torch.randint(len(rows), (count,), generator=generator)
     means, moments = candidates[rows[chosen]], moments[chosen]
     colours, seen = torch.zeros(count, 3), torch.zeros(count, 1)
@@ -99,10 +109,7 @@ def sample_points(
         own, differ = watch.colours(means, moments)
         colours += own * differ[:, None]
         seen += differ[:, None]
-    # a small thing holds fewer candidates than points, so the points spread around them
-    spacing = 2 * scene.bound / CANDIDATES ** (1 / 3)
-    means = means + spacing * (torch.rand(count, 3, generator=generator) - 0.5)
-    means = means.clamp(-scene.bound, scene.bound)
+    means = spread(means, CANDIDATES, scene.bound, generator)
     return Points(means, colours / seen, torch.tensor(times)[moments])
 
 
@@ -121,9 +128,10 @@ def _watches(scene: Scene, pictures: Pictures, times: list[float]) -> list[_Watc
 
 def _watch(views: list[View], pictures: Pictures, moments: list[int]) -> _Watch:
     camera = pictures.camera(views[0])
-    stride = max(1, min(camera.width, camera.height) // GRID)
-    taken = [pictures.load(view)[:, ::stride, ::stride].permute(1, 2, 0) for view in views]
+    taken, strides = zip(
+        *(coarse_picture(pictures.load(view), GRID) for view in views), strict=True
+    )
     pixels = torch.stack(taken)
     differences = (pixels.float() - pixels.float().median(dim=0).values).abs()
     changed = differences.amax(dim=3) > DIFFERENCE
-    return _Watch(camera, stride, torch.tensor(moments), pixels, changed)
+    return _Watch(camera, strides[0], torch.tensor(moments), pixels, changed)

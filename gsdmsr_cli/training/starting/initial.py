@@ -56,9 +56,14 @@ def initial_splats(
         return splats, torch.full((len(splats),), math.nan)
     given = _given_points(scene, pictures, most, generator)
     wanted = min(options.count, most) - len(given.means)
-    if not len(given.means) or (_start(scene, options) == "surfaces" and wanted > 0):
-        more = _new_points(scene, options, wanted, pictures, background, generator)
-        given = _joined(given, more)
+    start = _start(scene, options)
+    if not len(given.means) or (start == "surfaces" and wanted > 0):
+        moving = round(options.moving_share * wanted)
+        found = changing.sample_points(scene, pictures, moving, generator)
+        given, left = _joined(given, found), wanted - len(found.means)
+        if left:
+            more = _new_points(scene, start, left, pictures, background, generator)
+            given = _joined(given, more)
     means, colours, times = given
     n = len(means)
     sh = torch.zeros(n, (options.sh_degree + 1) ** 2, 3)
@@ -116,33 +121,12 @@ def _given_points(
 
 def _new_points(
     scene: Scene,
-    options: SplatOptions,
+    start: str,
     count: int,
     pictures: Pictures,
     background: Tensor,
     generator: torch.Generator,
 ) -> Points:
-    """Return points that the scene does not bring: a share on what moves, the others anywhere."""
-    moving = round(options.moving_share * count)
-    if not moving:
-        return _points_anywhere(scene, options, count, pictures, background, generator)
-    found = changing.sample_points(scene, pictures, moving, generator)
-    left = count - len(found.means)
-    if not left:
-        return found
-    others = _points_anywhere(scene, options, left, pictures, background, generator)
-    return _joined(found, others)
-
-
-def _points_anywhere(
-    scene: Scene,
-    options: SplatOptions,
-    count: int,
-    pictures: Pictures,
-    background: Tensor,
-    generator: torch.Generator,
-) -> Points:
-    start = _start(scene, options)
     if start == "silhouettes":
         return silhouettes.sample_points(scene, pictures, background, count, generator)
     if start == "surfaces":

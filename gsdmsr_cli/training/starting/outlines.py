@@ -10,7 +10,7 @@ from torch import Tensor
 from gsdmsr_cli.scene.camera import Camera
 from gsdmsr_cli.scene.pictures import Pictures
 from gsdmsr_cli.scene.scene import Scene
-from gsdmsr_cli.training.starting.sightings import coarse_places
+from gsdmsr_cli.training.starting.sightings import coarse_picture, coarse_places
 
 DIFFERENCE = 8
 """A pixel belongs to the silhouette if a channel differs this much from the background [1/255]."""
@@ -52,7 +52,7 @@ def outlines(scene: Scene, pictures: Pictures, background: Tensor) -> Iterator[O
     views = scene.split("train")
     for view in views[:: -(-len(views) // VIEWS)]:
         picture = pictures.load(view)
-        stride = max(1, min(picture.shape[1:]) // GRID)
-        pixels = picture[:, ::stride, ::stride].permute(1, 2, 0).float()
+        coarse, stride = coarse_picture(picture, GRID)
+        pixels = coarse.float()
         drawn = (pixels - plain).abs().amax(dim=2) > DIFFERENCE
         yield Outline(pixels, drawn, pictures.camera(view), stride)

@@ -45,6 +45,15 @@ def places(points: Tensor, camera: Camera) -> tuple[Tensor, Tensor, Tensor]:
     return column, row, (at[:, 2] > 0) & across & (row >= 0) & (row < camera.height)
 
 
+def coarse_picture(picture: Tensor, side: int) -> tuple[Tensor, int]:
+    """Return every n-th pixel (h, w, 3) of a picture (3, H, W), and n.
+
+    The shorter side has ``side`` of them or somewhat more, or all where it is shorter than that.
+    """
+    stride = max(1, min(picture.shape[1:]) // side)
+    return picture[:, ::stride, ::stride].permute(1, 2, 0), stride
+
+
 def coarse_places(points: Tensor, camera: Camera, stride: int) -> tuple[Tensor, Tensor, Tensor]:
     """Return rows and columns (P,) of points (P, 3) in every ``stride``-th pixel, and who is shown.
 
@@ -54,6 +63,22 @@ def coarse_places(points: Tensor, camera: Camera, stride: int) -> tuple[Tensor, 
     column = (across / stride).long().clamp(0, (camera.width - 1) // stride)
     row = (down / stride).long().clamp(0, (camera.height - 1) // stride)
     return row, column, shown
+
+
+def spread(chosen: Tensor, candidates: int, bound: float, generator: torch.Generator) -> Tensor:
+    """Return points (P, 3) of the box, each somewhere about one that was chosen of candidates.
+
+    A small thing holds fewer candidates than points are wanted, so some are chosen many times.
+
+    Args:
+        chosen: (P, 3) of them.
+        candidates: how many fill the box evenly.
+        bound: half edge of the box.
+        generator: source of the random places.
+    """
+    spacing: float = 2 * bound / candidates ** (1 / 3)
+    means = chosen + spacing * (torch.rand(len(chosen), 3, generator=generator) - 0.5)
+    return means.clamp(-bound, bound)
 
 
 def colours_of(points: Tensor, scene: Scene, pictures: Pictures) -> Tensor:

@@ -8,7 +8,7 @@ from torch import Tensor
 from gsdmsr_cli.scene.pictures import Pictures
 from gsdmsr_cli.scene.scene import Scene
 from gsdmsr_cli.training.starting.outlines import outlines
-from gsdmsr_cli.training.starting.sightings import Points, at_unknown_times
+from gsdmsr_cli.training.starting.sightings import Points, at_unknown_times, spread
 
 CANDIDATES, MOST_CANDIDATES = 20, 500_000
 """Random points per point wanted, and how many at most, for the sake of memory."""
@@ -48,10 +48,7 @@ def sample_points(
         share[~known] = share[known].mean() if known.any() else 0.0
     share = share.clamp(min=1e-3)
     rows = torch.multinomial(share.pow(SHARPNESS), count, replacement=True, generator=generator)
-    # a small thing holds fewer candidates than points, so the points spread around them
-    spacing = 2 * scene.bound / len(candidates) ** (1 / 3)
-    means = candidates[rows] + spacing * (torch.rand(count, 3, generator=generator) - 0.5)
-    means = means.clamp(-scene.bound, scene.bound)
+    means = spread(candidates[rows], len(candidates), scene.bound, generator)
     mean_colours = colours / inside.clamp(min=1)[:, None]
     own = torch.where(inside[rows, None] > 0, mean_colours[rows], 0.5)
     return at_unknown_times(means, own)
