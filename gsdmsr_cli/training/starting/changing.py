@@ -89,8 +89,10 @@ def sample_points(
         count: number of points.
         generator: source of the random points.
     """
+    if not count:
+        return _NONE
     times = scene.train_times[:: -(-len(scene.train_times) // LOOKED_AT)]
-    watches = _watches(scene, pictures, times) if count else []
+    watches = _watches(scene, pictures, times)
     if not watches:  # nothing is drawn at random, so all else is as if it had not been tried
         return _NONE
     candidates = (2 * torch.rand(CANDIDATES, 3, generator=generator) - 1) * scene.bound
