@@ -42,6 +42,8 @@ class Parameter:
         fill: value of a row that is new: of a splat that has stood still and begins to move.
         time_axis: the dimension whose entries belong to times from 0 to 1, if there is one.
         time_place: where times lie on it; it rises from 0 to 1.
+        time_degree: of the B-splines whose coefficients its entries are, an odd number; 1 are the
+            straight lines between them.
         rows_per_splat: how many rows it has at most for each splat, where it is shared and its rows
             are counted in training; 0 where they are counted at the start.
     """
@@ -53,6 +55,7 @@ class Parameter:
     fill: float = 0.0
     time_axis: int | None = None
     time_place: Place = evenly
+    time_degree: int = 1
     rows_per_splat: int = 0
 
     def __post_init__(self) -> None:
@@ -75,9 +78,9 @@ class Parameter:
         if self.time_axis is None:
             return
         values = self.tensor.detach().movedim(self.time_axis, 0)
-        end = len(values) - 1
-        lower = math.floor(self.time_place(first) * end)
-        upper = math.ceil(self.time_place(last) * end)
+        end, further = len(values) - 1, self.time_degree // 2
+        lower = max(math.floor(self.time_place(first) * end) - further, 0)
+        upper = min(math.ceil(self.time_place(last) * end) + further, end)
         values[:lower] = values[lower].clone()
         values[upper + 1 :] = values[upper].clone()
 
@@ -112,6 +115,7 @@ def name_parameters(
     rate: Rate,
     time_axes: Mapping[str, int] = NO_TIMES,
     time_place: Place = evenly,
+    time_degree: int = 1,
 ) -> list[Parameter]:
     """Return a grid's levels or a network's layers as parameters "name.0.space" and so on.
 
@@ -121,6 +125,7 @@ def name_parameters(
         rate: the learning rate that all follow.
         time_axes: dimensions that run over times, by the names of the parts' fields.
         time_place: where times lie on those.
+        time_degree: of the B-splines along them.
     """
     return [
         Parameter(
@@ -129,6 +134,7 @@ def name_parameters(
             rate=rate,
             time_axis=time_axes.get(field),
             time_place=time_place,
+            time_degree=time_degree,
         )
         for index, part in enumerate(parts)
         for field, tensor in part._asdict().items()

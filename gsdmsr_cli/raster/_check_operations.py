@@ -101,7 +101,9 @@ _GRID_NAMES = ("coarse space", "coarse time", "fine space", "fine time")
 def _look_up(device: str, dtype: torch.dtype) -> Values:
     tensors = _grids(device, dtype)
     points, beside = _leaves(device, dtype, 0.7 * _random(_COUNT, 3), _random(_COUNT, 3, seed=1))
-    features = planes.lookup_at_times(_levels(tensors), points, [-0.37, 0.6], beside=beside)
+    given = _levels(tensors), points, [-0.37, 0.6]
+    found = (planes.lookup_at_times(*given, beside=beside, degree=d) for d in planes.DEGREES)
+    features = torch.cat([*found])
     names = ("points", "features beside", *_GRID_NAMES)
     return _with_gradients(features, names, [points, beside, *tensors])
 

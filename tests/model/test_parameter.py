@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from gsdmsr_cli.model.motion._grids import between, sparser_at_ends
 from gsdmsr_cli.model.parameter import NO_TIMES, Parameter, evenly, name_parameters
 from gsdmsr_cli.ops import planes
+from gsdmsr_cli.ops.planes.levels import cubic_weights
 
 TIMES = [0.0, 0.25, 0.5, 0.75, 1.0]
 
@@ -55,6 +56,26 @@ def test_what_is_shown_stays_and_what_is_not_stands_still(
         torch.testing.assert_close(between(after, time), after[-1])
     if time <= first - cell:
         torch.testing.assert_close(between(after, time), after[0])
+
+
+@settings(deadline=None)
+@given(st.integers(2, 9), st.floats(0, 1), st.floats(0, 1), st.floats(0, 1))
+def test_of_a_cubic_curve_what_is_shown_stays_as_well(
+    nodes: int, one: float, other: float, time: float
+) -> None:
+    first, last = sorted((one, other))
+    before = torch.rand(nodes, dtype=torch.float64, generator=torch.Generator().manual_seed(nodes))
+    parameter = Parameter("x", before.clone(), rate="planes", time_axis=0, time_degree=3)
+    parameter.hold_outside(first, last)
+    after, place = parameter.tensor.detach(), torch.tensor(time * (nodes - 1), dtype=torch.float64)
+    weights = cubic_weights(place, nodes)
+    if first <= time <= last:
+        torch.testing.assert_close(weights @ after, weights @ before)
+    cell = 1 / (nodes - 1)
+    if time >= last + 3 * cell:
+        torch.testing.assert_close(weights @ after, after[-1])
+    if time <= first - 3 * cell:
+        torch.testing.assert_close(weights @ after, after[0])
 
 
 @settings(deadline=None)

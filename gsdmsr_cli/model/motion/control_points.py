@@ -43,6 +43,8 @@ class Options:
         time_ratio: the grid's resolution in time per distinct train time.
         time_ends: density of the grid's nodes at the first and the last time, in units of that of
             an even grid: above 0, at most 1.
+        time_degree: of the B-splines between them, 1 (straight lines) or 3 (cubic curves, whose
+            velocity and acceleration do not jump).
         width: width of the network's two hidden layers, a multiple of 16.
         space_smoothness, time_smoothness, time_stillness: weights of the plane regularisers.
         rigidity: weight of the control points' deviation from rigid motion.
@@ -57,6 +59,7 @@ class Options:
     channels: int = 16
     time_ratio: float = 0.2
     time_ends: float = 1.0
+    time_degree: int = 1
     width: int = 32
     space_smoothness: float = 1e-4
     time_smoothness: float = 1e-2
@@ -69,6 +72,7 @@ class Options:
         require_levels(self, "levels")
         require_multiples(self, "channels", "width")
         require(self, "time_ends", 0 < self.time_ends <= 1, "above 0, at most 1")
+        require(self, "time_degree", self.time_degree in planes.DEGREES, "1 or 3")
         require_progress(self, "rigidity_until")
 
 
@@ -87,7 +91,9 @@ class ControlPointMotion(ControlPoints):
         widths = [options.channels * len(options.levels), options.width, options.width, OUTPUTS]
         self.layers = network.new_network(widths, generator)
         self._parameters += (
-            *name_parameters("grid", self.levels, "planes", planes.TIME_AXES, self._place),
+            *name_parameters(
+                "grid", self.levels, "planes", planes.TIME_AXES, self._place, options.time_degree
+            ),
             *name_parameters("network", self.layers, "network"),
         )
 
@@ -102,7 +108,9 @@ class ControlPointMotion(ControlPoints):
     def _deformations(self, points: Tensor, times: Sequence[float]) -> Tensor:
         """Return the outputs for points; times [0, 1] are mapped to the whole grid, [-1, 1]."""
         given = self.levels, points, times, self.facts.box
-        features = planes.lookup_at_times(*given, place=self._on_grid)
+        features = planes.lookup_at_times(
+            *given, place=self._on_grid, degree=self.options.time_degree
+        )
         outputs = network.apply_network(self.layers, features)
         return outputs.view(len(times), len(points), OUTPUTS)
 

@@ -20,6 +20,7 @@ from gsdmsr_cli.ops.planes import cpu as kernels
 from gsdmsr_cli.ops.planes import cuda
 from gsdmsr_cli.ops.planes.levels import (
     CUBE,
+    DEGREES,
     TIME_AXES,
     Box,
     Corner,
@@ -37,6 +38,7 @@ from gsdmsr_cli.ops.planes.twin import lookup_twin, penalty_twin
 
 __all__ = [
     "CUBE",
+    "DEGREES",
     "TIME_AXES",
     "Box",
     "Corner",
@@ -81,23 +83,28 @@ def lookup_at_times(
     box: Box = CUBE,
     beside: Tensor | None = None,
     place: Place = as_given,
+    degree: int = 1,
 ) -> Tensor:
     """Return what ``lookup`` does at each of V times, (V N, C), one time after the other.
 
-    ``place`` takes each of the times to where it lies on the grid, in [-1, 1]. In a step that is
-    recorded the times are those of its views, and so they are when it is replayed.
+    Args:
+        levels, points, box, beside: as there.
+        times: in a step that is recorded those of its views, and so they are when it is replayed.
+        place: takes each of the times to where it lies on the grid, in [-1, 1].
+        degree: of the B-splines between the nodes in time, one of ``DEGREES``; with 3 a node has a
+            part in four cells, see ``levels.cubic_weights``.
     """
     tensors = [tensor for level in levels for tensor in level]
     own = points.new_empty(len(points), 0) if beside is None else beside
     form = choose(points, own, *tensors)
     if form == "cuda":
         placed = to_cube(box).tolist()
-        return cuda.lookup(points, own, times, placed, tensors, precision.chosen(), place)
+        return cuda.lookup(points, own, times, placed, tensors, precision.chosen(), place, degree)
     if form == "cpu":
         given = points.contiguous()
-        features = [_Lookup.apply(given, own, place(time), box, *tensors) for time in times]
+        features = [_Lookup.apply(given, own, place(t), degree, box, *tensors) for t in times]
     else:
-        features = [lookup_twin(levels, points, place(time), box, own) for time in times]
+        features = [lookup_twin(levels, points, place(t), box, own, degree) for t in times]
     return features[0] if len(features) == 1 else torch.cat(features)
 
 
@@ -106,14 +113,20 @@ class _Lookup(Function):
 
     @staticmethod
     def forward(
-        ctx: Any, points: Tensor, beside: Tensor, time: float, box: Box, *tensors: Tensor
+        ctx: Any,
+        points: Tensor,
+        beside: Tensor,
+        time: float,
+        degree: int,
+        box: Box,
+        *tensors: Tensor,
     ) -> Tensor:
         spaces, times = (tuple(map(array, part)) for part in (tensors[::2], tensors[1::2]))
         lines = tuple(np.empty(plane.shape[:2] + plane.shape[3:], np.float32) for plane in times)
         ctx.columns = sum(plane.shape[1] * LANES for plane in spaces)
         features = torch.empty(len(points), ctx.columns + beside.shape[1])
         features[:, ctx.columns :] = beside
-        when = to_cube(box).astype(np.float32), time
+        when = to_cube(box).astype(np.float32), time, degree > 1
         kernels.lookup(array(points), *when, spaces, times, lines, array(features))
         ctx.when, ctx.spaces, ctx.lines = when, spaces, lines
         ctx.save_for_backward(points, *tensors)
@@ -138,7 +151,7 @@ class _Lookup(Function):
         if wanted and rows is not None:
             d_points = spread(d_points, rows, count)
         d_beside = d_features[:, ctx.columns :] if ctx.needs_input_grad[1] else None
-        return d_points if wanted else None, d_beside, None, None, *gradients
+        return d_points if wanted else None, d_beside, None, None, None, *gradients
 
 
 def penalty(

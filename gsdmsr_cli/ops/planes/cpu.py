@@ -3,8 +3,9 @@
 A level holds three spatial planes (xy, xz, yz) and three temporal ones (x, y, z against time).
 Channels come in chunks of 16, one vector: space is (3, chunks, R, R, 16) with the plane's second
 axis first, time is (3, chunks, T, R, 16). All points of a frame share one time, so the temporal
-planes collapse to three lines once a frame. The feature is the product of the six bilinear or
-linear samples, positions clamped to the border. One call serves all levels.
+planes collapse to three lines once a frame, along straight lines or cubic curves. The feature is
+the product of the six bilinear or linear samples, positions clamped to the border. One call serves
+all levels.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ _LANES = simd.LANES
 _BLOCKS = 64
 _HALF = float32(0.5)
 _ONE = float32(1)
+_TWO_THIRDS, _SIXTH = float32(2 / 3), float32(1 / 6)
 
 
 @inline
@@ -35,9 +37,49 @@ def cell(x, size):
 
 
 @inline
-def collapse(planes, time, lines, axis, chunk):
+def _bump(x):
+    """Return the uniform cubic B-spline at x nodes from its middle."""
+    x = abs(x)
+    if x < _ONE:
+        return _TWO_THIRDS + x * x * (_HALF * x - _ONE)
+    rest = float32(2) - x
+    return rest * rest * rest * _SIXTH if rest > float32(0) else float32(0)
+
+
+@inline
+def _weight(node, i, w, size, cubic):
+    """Return what a node counts w cells beyond node i of ``size``, see ``levels.cubic_weights``.
+
+    On straight lines these are nodes i and i + 1 alone.
+    """
+    if not cubic:
+        return w if node > i else _ONE - w
+    weight = _bump(float32(node - i) - w)
+    before, after = _bump(float32(-1 - i) - w), _bump(float32(size - i) - w)
+    if node == 0:
+        weight += float32(2) * before
+    if node == 1:
+        weight -= before
+    if node == size - 1:
+        weight += float32(2) * after
+    if node == size - 2:
+        weight -= after
+    return weight
+
+
+@inline
+def collapse(planes, time, cubic, lines, axis, chunk):
     """Interpolate a chunk of one of (3, chunks, T, R, 16) temporal planes at ``time`` to a line."""
-    i, w = cell(time, planes.shape[2])
+    size = planes.shape[2]
+    i, w = cell(time, size)
+    if cubic:
+        lines[axis, chunk] = float32(0)
+        for node in range(max(i - 1, 0), min(i + 3, size)):
+            weight = _weight(node, i, w, size, cubic)
+            for r in range(planes.shape[3]):
+                for k in range(_LANES):
+                    lines[axis, chunk, r, k] += planes[axis, chunk, node, r, k] * weight
+        return
     for r in range(planes.shape[3]):
         for k in range(_LANES):
             low, high = planes[axis, chunk, i, r, k], planes[axis, chunk, i + 1, r, k]
@@ -45,16 +87,18 @@ def collapse(planes, time, lines, axis, chunk):
 
 
 @inline
-def spread(d_lines, time, d_planes, axis, chunk):
-    """Write the gradient of a chunk of a temporal plane: that of the line at two times, else 0."""
-    i, w = cell(time, d_planes.shape[2])
-    d_planes[axis, chunk, :i] = float32(0)
-    d_planes[axis, chunk, i + 2 :] = float32(0)
-    for r in range(d_planes.shape[3]):
-        for k in range(_LANES):
-            d = d_lines[axis, chunk, r, k]
-            d_planes[axis, chunk, i, r, k] = d * (_ONE - w)
-            d_planes[axis, chunk, i + 1, r, k] = d * w
+def spread(d_lines, time, cubic, d_planes, axis, chunk):
+    """Write the gradient of a chunk of a temporal plane: that of the line at few times, else 0."""
+    size = d_planes.shape[2]
+    i, w = cell(time, size)
+    first, last = (max(i - 1, 0), min(i + 2, size - 1)) if cubic else (i, i + 1)
+    d_planes[axis, chunk, :first] = float32(0)
+    d_planes[axis, chunk, last + 1 :] = float32(0)
+    for node in range(first, last + 1):
+        weight = _weight(node, i, w, size, cubic)
+        for r in range(d_planes.shape[3]):
+            for k in range(_LANES):
+                d_planes[axis, chunk, node, r, k] = d_lines[axis, chunk, r, k] * weight
 
 
 @inline
@@ -83,11 +127,12 @@ def _in_box(points, box, i, axis):
 
 
 @parallel
-def lookup(points, box, time, spaces, times, lines, features):
+def lookup(points, box, time, cubic, spaces, times, lines, features):
     """Write the (N, C) features of (N, 3) points.
 
     Args:
         points: positions; times ``box[0]`` plus ``box[1]`` (2, 3) they lie in [-1, 1].
+        cubic: whether cubic B-splines lie between the nodes in time, not straight lines.
         spaces, times: the planes, one array per level.
         lines: one array (3, chunks, R, 16) per level, out: the temporal planes at ``time``.
         features: out, the levels side by side; columns beyond theirs are left as they are.
@@ -96,7 +141,7 @@ def lookup(points, box, time, spaces, times, lines, features):
     for level in range(len(spaces)):
         for axis in range(3):
             for chunk in range(spaces[level].shape[1]):
-                collapse(times[level], float32(time), lines[level], axis, chunk)
+                collapse(times[level], float32(time), cubic, lines[level], axis, chunk)
     for block in prange(_BLOCKS):
         offset = 0
         for level in range(len(spaces)):
@@ -143,15 +188,16 @@ def _scatter_bilinear(flat, at, row, wx, wy, d):
 
 @parallel
 def lookup_backward(
-    points, box, time, spaces, lines, d_features, d_spaces, d_times, d_lines, shares, d_points
-):
+    points, box, time, cubic, spaces, lines, d_features, d_spaces, d_times, d_lines, shares,
+    d_points,
+):  # fmt: skip
     """Write the gradients of the planes and, if wanted, of the points.
 
     Every thread owns whole chunks of 16 channels, so that threads never write to one place and
     the sums do not depend on their number. Points outside [-1, 1] get no gradient along that axis.
 
     Args:
-        points, box, time, spaces, lines: see ``lookup``.
+        points, box, time, cubic, spaces, lines: see ``lookup``.
         d_features: (N, C or more) of all levels side by side.
         d_spaces, d_times: out, one array per level.
         d_lines: room for the gradients of ``lines``.
@@ -214,7 +260,7 @@ def lookup_backward(
             _scatter_linear(d_strips, y, wy, d_y)
             _scatter_linear(d_strips, z, wz, d_z)
         for axis in range(3):
-            spread(d_line, float32(time), d_times[level], axis, c)
+            spread(d_line, float32(time), cubic, d_times[level], axis, c)
     for block in prange(_BLOCKS):
         rows = d_points.shape[0]
         for i in range(rows * block // _BLOCKS, rows * (block + 1) // _BLOCKS):

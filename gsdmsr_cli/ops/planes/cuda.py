@@ -44,6 +44,7 @@ class _Levels(ctypes.Structure):
     _fields_ = (
         ("count", ctypes.c_int),
         ("moments", ctypes.c_int),
+        ("cubic", ctypes.c_int),
         ("moment", ctypes.c_float * MOST_VIEWS),
         ("scale", ctypes.c_float * 3),
         ("shift", ctypes.c_float * 3),
@@ -57,10 +58,12 @@ class _Times(NamedTuple):
     Attributes:
         own: the times, in the order in which features are wanted.
         place: where each lies on the grid, in [-1, 1].
+        degree: of the B-splines between nodes, see ``planes.lookup_at_times``.
     """
 
     own: Sequence[float]
     place: Place
+    degree: int
 
     def placed(self) -> list[float]:
         """Return where they lie."""
@@ -79,6 +82,7 @@ def lookup(
     tensors: Sequence[Tensor],
     dtype: torch.dtype = torch.float32,
     place: Place = as_given,
+    degree: int = 1,
 ) -> Tensor:
     """Return features (V N, C + K) of points at V times, all levels and ``beside`` side by side.
 
@@ -90,8 +94,9 @@ def lookup(
         tensors: of each level space (3, chunks, R, R, 16) and time (3, chunks, T, R, 16).
         dtype: the format that grids are read in, see ``SOURCES``. Features are float32, and so
             are gradients, which pass through the rounding as if there were none.
+        degree: see ``planes.lookup_at_times``.
     """
-    given = points.contiguous(), beside, _Times(times, place), to_cube, dtype
+    given = points.contiguous(), beside, _Times(times, place, degree), to_cube, dtype
     features: Tensor = _Lookup.apply(*given, *tensors)
     return features
 
@@ -119,7 +124,7 @@ def _pack(
         raise ValueError(f"{len(moments.own)} times; at most {MOST_VIEWS} are looked up at once")
     cube = ((ctypes.c_float * 3)(*part) for part in to_cube)
     placed = (ctypes.c_float * MOST_VIEWS)(*moments.placed())
-    packed = _Levels(len(spaces), len(moments.own), placed, *cube)
+    packed = _Levels(len(spaces), len(moments.own), moments.degree > 1, placed, *cube)
     recording.vary(packed, moments.fill)
     columns = spaces, times, nodes, lines, gradients[::2], gradients[1::2], d_lines
     for name, column in zip(_POINTERS, columns, strict=True):

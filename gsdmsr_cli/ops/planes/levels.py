@@ -33,6 +33,39 @@ def evenly(time: float) -> float:
     return 2 * time - 1
 
 
+DEGREES = 1, 3
+"""Of the B-splines that may lie between nodes in time: straight lines, or cubic curves."""
+
+
+def bump(x: Tensor) -> Tensor:
+    """Return the uniform cubic B-spline at x nodes from its middle; it is 0 from 2 on."""
+    x = x.abs()
+    inner, outer = 2 / 3 - x * x * (1 - x / 2), (2 - x).clamp(min=0) ** 3 / 6
+    return torch.where(x < 1, inner, outer)
+
+
+def cubic_weights(place: Tensor, count: int) -> Tensor:
+    """Return what each of ``count`` nodes counts at a place () in [0, count - 1], (count,).
+
+    The curve is the cubic B-spline whose coefficients the nodes are, continued by a node before the
+    first and one after the last, each on a straight line with its two neighbours. So the curve ends
+    at its first and last node, without curvature (a natural spline; de Boor, A Practical Guide to
+    Splines, 2001, chapters IV and IX).
+
+    Args:
+        place: in cells from the first node on.
+        count: 2 or more.
+    """
+    at = torch.arange(-1, count + 1, dtype=place.dtype, device=place.device)
+    before, *_, after = own = bump(at - place)
+    weights: Tensor = own[1:-1].clone()
+    weights[0] += 2 * before
+    weights[1] -= before
+    weights[-1] += 2 * after
+    weights[-2] -= after
+    return weights
+
+
 class Level(NamedTuple):
     """One resolution of a grid of C channels, C a multiple of 16.
 

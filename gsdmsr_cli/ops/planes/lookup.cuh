@@ -28,6 +28,7 @@ struct Level {
 
 struct Levels {
     int count, moments;
+    int cubic;  // whether cubic B-splines lie between the nodes in time, not straight lines
     float moment[MOST_VIEWS];  // the times, in [-1, 1]
     float scale[3], shift[3];  // take positions to [-1, 1]
     Level level[MOST_LEVELS];
@@ -48,6 +49,27 @@ __device__ __forceinline__ Cell cell(float x, int size) {
     return c;
 }
 
+// The uniform cubic B-spline at x nodes from its middle.
+__device__ __forceinline__ float bump(float x) {
+    x = fabsf(x);
+    float rest = fmaxf(2.0f - x, 0.0f);
+    return x < 1.0f ? 2.0f / 3.0f + x * x * (0.5f * x - 1.0f) : rest * rest * rest / 6.0f;
+}
+
+// What a node in time counts at a place: on a curve the nodes before the first and after the last lie on a
+// straight line with their two neighbours, so that it ends without curvature.
+__device__ __forceinline__ float weight_of(const Cell &at, int node, int times, int cubic) {
+    int away = node - at.lower;
+    if (!cubic) return away == 0 ? 1.0f - at.upper_weight : away == 1 ? at.upper_weight : 0.0f;
+    float before = bump(-1 - at.lower - at.upper_weight);
+    float after = bump(times - at.lower - at.upper_weight), weight = bump(away - at.upper_weight);
+    if (node == 0) weight += 2.0f * before;
+    if (node == 1) weight -= before;
+    if (node == times - 1) weight += 2.0f * after;
+    if (node == times - 2) weight -= after;
+    return weight;
+}
+
 // Writes the lines of all levels, and the nodes if they are a copy; one block along y per level.
 extern "C" __global__ void __launch_bounds__(THREADS) collapse(
     const __grid_constant__ Levels levels
@@ -60,11 +82,18 @@ extern "C" __global__ void __launch_bounds__(THREADS) collapse(
     if (k >= levels.moments * lines) return;
     Cell at = cell(levels.moment[k / lines], level.times);
     int line = k % lines / row;
-    const float *low = level.time + (size_t)(line * level.times + at.lower) * row + k % row;
-    store(level.lines + k, low[0] + (low[row] - low[0]) * at.upper_weight);
+    const float *first = level.time + (size_t)(line * level.times) * row + k % row;
+    const float *low = first + (size_t)at.lower * row;
+    float value = low[0] + (low[row] - low[0]) * at.upper_weight;
+    if (levels.cubic) {
+        value = 0.0f;
+        for (int n = max(at.lower - 1, 0); n <= min(at.lower + 2, level.times - 1); n++)
+            value += weight_of(at, n, level.times, 1) * first[(size_t)n * row];
+    }
+    store(level.lines + k, value);
 }
 
-// Writes the gradients of the temporal planes: of each time those of the lines at two nodes, 0 at others.
+// Writes the gradients of the temporal planes: of each time those of the lines at few nodes, 0 at others.
 extern "C" __global__ void __launch_bounds__(THREADS) spread(
     const __grid_constant__ Levels levels
 ) {
@@ -75,8 +104,7 @@ extern "C" __global__ void __launch_bounds__(THREADS) spread(
     float d = 0.0f;
     for (int m = 0; m < levels.moments; m++, d_line += 3 * level.chunks * row) {
         Cell at = cell(levels.moment[m], level.times);
-        int node = k / row % level.times - at.lower;
-        float weight = node == 0 ? 1.0f - at.upper_weight : node == 1 ? at.upper_weight : 0.0f;
+        float weight = weight_of(at, k / row % level.times, level.times, levels.cubic);
         // not multiplied where the weight is 0: what is not finite must not spread
         if (weight != 0.0f) d += weight * *d_line;
     }

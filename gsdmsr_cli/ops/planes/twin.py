@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from gsdmsr_cli.backends.cpu.simd import LANES
-from gsdmsr_cli.ops.planes.levels import CUBE, Box, Level, to_cube
+from gsdmsr_cli.ops.planes.levels import CUBE, Box, Level, cubic_weights, to_cube
 
 _SPACE_AXES = ((0, 1), (0, 2), (1, 2))
 
@@ -19,11 +19,12 @@ def lookup_twin(
     time: float,
     box: Box = CUBE,
     beside: Tensor | None = None,
+    degree: int = 1,
 ) -> Tensor:
     """Return what ``lookup`` does, in plain torch, for any device and dtype."""
     scale, shift = points.new_tensor(to_cube(box))
     places, when = points * scale + shift, points.new_tensor(time)
-    features = [_sample_level(level, places, when) for level in levels]
+    features = [_sample_level(level, places, when, degree) for level in levels]
     return torch.cat(features if beside is None else [*features, beside], dim=1)
 
 
@@ -33,11 +34,15 @@ def _cell(x: Tensor, size: int) -> tuple[Tensor, Tensor]:
     return lower, u - lower
 
 
-def _sample_level(level: Level, points: Tensor, when: Tensor) -> Tensor:
+def _sample_level(level: Level, points: Tensor, when: Tensor, degree: int) -> Tensor:
     size = level.space.shape[3]
     lower, upper_weight = _cell(points, size)
     moment, later = _cell(when, level.time.shape[2])
-    lines = torch.lerp(level.time[:, :, moment], level.time[:, :, moment + 1], later)
+    if degree == 1:
+        lines = torch.lerp(level.time[:, :, moment], level.time[:, :, moment + 1], later)
+    else:
+        weights = cubic_weights(moment + later, level.time.shape[2])
+        lines = torch.einsum("t,pctrk->pcrk", weights, level.time)
     feature = points.new_ones(level.space.shape[1], len(points), LANES)
     for plane, (first, second) in zip(level.space, _SPACE_AXES, strict=True):
         x, y = lower[:, first], lower[:, second]

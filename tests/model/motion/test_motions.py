@@ -720,6 +720,7 @@ def test_control_points_follow_splats_that_have_changed_in_place() -> None:
         ({"gather": 0.5}, "gather is 0.5; allowed: 1 or more"),
         ({"time_ends": 0.0}, "time_ends is 0.0; allowed: above 0, at most 1"),
         ({"time_ends": 1.5}, "time_ends is 1.5; allowed: above 0, at most 1"),
+        ({"time_degree": 2}, "time_degree is 2; allowed: 1 or 3"),
         ({"rigidity_until": 1.5}, "rigidity_until is 1.5; allowed: a progress from 0 to 1"),
     ],
 )
@@ -787,6 +788,26 @@ def test_control_points_may_have_fewer_nodes_at_both_ends() -> None:
         assert_equal(moved_by(uneven, splats, time), expected, rtol=1e-5, atol=1e-6)
     still = [moved_by(uneven, splats, time) for time in (0.8, 1.0)]
     assert_equal(*still, rtol=1e-5, atol=1e-6)
+
+
+def test_control_points_may_go_along_cubic_curves() -> None:
+    """Their velocity jumps at a node of the grid only where lines lie between nodes."""
+    splats, jumps = splats_of(COUNT), []
+    for degree in (1, 3):
+        motion = disturbed(started("control_points", COUNT, time_degree=degree))
+        nodes = motion.tensors()["grid.0.time"].shape[2]
+        node, step = 3 / (nodes - 1), 1e-2 / (nodes - 1)
+        before, at, after = (
+            moved_by(motion, splats, node + shift).means.detach() for shift in (-step, 0.0, step)
+        )
+        jumps.append(float((after - 2 * at + before).norm() / (after - before).norm()))
+    linear, cubic = jumps
+    assert cubic < 0.1 * linear
+    curved = disturbed(started("control_points", COUNT, time_degree=3))
+    shown = [moved_by(curved, splats, time) for time in (0.4, 0.5, 0.6)]
+    model_of(splats, curved).hold_outside(0.4, 0.6)
+    for time, expected in zip((0.4, 0.5, 0.6), shown, strict=True):
+        assert_equal(moved_by(curved, splats, time), expected, rtol=1e-5, atol=1e-6)
 
 
 def test_control_points_may_move_freely_in_the_end() -> None:

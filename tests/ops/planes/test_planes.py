@@ -11,11 +11,13 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from kernel_checks import assert_near, assert_same_on_threads, generator, leaves
+from scipy.interpolate import BSpline
 from torch import Tensor
 
 from gsdmsr_cli.ops import planes
 from gsdmsr_cli.ops.planes import Level
 from gsdmsr_cli.ops.planes import cpu as kernels
+from gsdmsr_cli.ops.planes.levels import cubic_weights
 
 PAIRS = ((0, 1), (0, 2), (1, 2))
 
@@ -27,6 +29,7 @@ sizes = st.lists(
     max_size=3,
 )
 times = st.floats(-1, 1, width=32)
+degrees = st.sampled_from(planes.DEGREES)
 
 
 def tensors_of(shapes: Sizes, seed: int = 0) -> list[Tensor]:
@@ -77,23 +80,46 @@ def test_twin_is_a_product_of_hat_functions(shapes: Sizes, count: int, time: flo
     torch.testing.assert_close(planes.lookup_twin(levels, points, time), expected)
 
 
-def test_twin_passes_gradcheck() -> None:
+def continued(nodes: np.ndarray) -> BSpline:
+    """The cubic B-spline of nodes at 0, 1, ... by scipy, continued straight on both sides."""
+    before, after = 2 * nodes[:1] - nodes[1:2], 2 * nodes[-1:] - nodes[-2:-1]
+    knots = np.arange(-3, len(nodes) + 3, dtype=float)
+    return BSpline(knots, np.concatenate([before, nodes, after]), 3)
+
+
+@given(st.integers(2, 9), st.floats(0, 1))
+@settings(max_examples=60, deadline=None)
+def test_cubic_weights_are_those_of_a_natural_spline(count: int, share: float) -> None:
+    nodes, place = np.random.default_rng(count).normal(size=count), share * (count - 1)
+    weights = cubic_weights(torch.tensor(place, dtype=torch.float64), count).numpy()
+    curve = continued(nodes)
+    assert weights @ nodes == pytest.approx(float(curve(place)), abs=1e-12)
+    for end in (0, count - 1):
+        assert curve(end) == pytest.approx(nodes[end])
+        assert curve(end, nu=2) == pytest.approx(0, abs=1e-12)
+
+
+@pytest.mark.parametrize("degree", planes.DEGREES)
+def test_twin_passes_gradcheck(degree: int) -> None:
     tensors = leaves(tensors_of([(3, 4, 16)]), torch.float64)
     points = (points_of(2).double() * 0.7).requires_grad_()
 
     def few(points: Tensor, *tensors: Tensor) -> Tensor:
-        return planes.lookup_twin(levels_of(list(tensors)), points, 0.3)[:, ::5]
+        levels = levels_of(list(tensors))
+        return planes.lookup_twin(levels, points, 0.3, degree=degree)[:, ::5]
 
     assert torch.autograd.gradcheck(few, (points, *tensors))
 
 
-@given(sizes, st.integers(1, 9) | st.just(333), times, st.integers(0, 99))
-@settings(max_examples=40, deadline=None)
-def test_lookup_matches_the_twin(shapes: Sizes, count: int, time: float, seed: int) -> None:
+@given(sizes, st.integers(1, 9) | st.just(333), times, st.integers(0, 99), degrees)
+@settings(max_examples=60, deadline=None)
+def test_lookup_matches_the_twin(
+    shapes: Sizes, count: int, time: float, seed: int, degree: int
+) -> None:
     start = [points_of(count, seed), *tensors_of(shapes, seed)]
     ours, exact = leaves(start, torch.float32), leaves(start, torch.float64)
-    found = planes.lookup(levels_of(ours[1:]), ours[0], time)
-    truth = planes.lookup_twin(levels_of(exact[1:]), exact[0], time)
+    found = planes.lookup_at_times(levels_of(ours[1:]), ours[0], [time], degree=degree)
+    truth = planes.lookup_twin(levels_of(exact[1:]), exact[0], time, degree=degree)
     assert found.shape == (count, sum(channels for _, _, channels in shapes))
     assert_near(found, truth, 1e-5, "features")
     weights = torch.randn(found.shape, generator=generator(seed))
@@ -220,25 +246,32 @@ def test_times_outside_are_those_at_the_ends(look: Any) -> None:
     assert not torch.equal(look(levels, points, -1.0), look(levels, points, 1.0))
 
 
-@given(st.integers(2, 7), st.integers(2, 5), times)
-@settings(max_examples=20, deadline=None)
-def test_time_collapses_linearly_and_spreads_as_the_adjoint(
-    moments: int, size: int, time: float
+@given(st.integers(2, 7), st.integers(2, 5), times, st.booleans())
+@settings(max_examples=40, deadline=None)
+def test_time_collapses_to_a_line_and_spreads_as_the_adjoint(
+    moments: int, size: int, time: float, cubic: bool
 ) -> None:
     rng = np.random.default_rng(moments)
     grid = rng.normal(size=(3, 2, moments, size, 16)).astype(np.float32)
     lines, d_grid = np.empty((3, 2, size, 16), np.float32), np.empty_like(grid)
     chunks = [(axis, chunk) for axis in range(3) for chunk in range(2)]
     for place in chunks:
-        kernels.collapse(grid, np.float32(time), lines, *place)
-    weights = hats(torch.tensor([time], dtype=torch.float64), moments)[0].numpy()
-    # the place in time is rounded twice, its error counts as the steepest slope; so is the result
+        kernels.collapse(grid, np.float32(time), cubic, lines, *place)
+    if cubic:
+        expected = continued(grid.astype(float).transpose(2, 0, 1, 3, 4))(
+            (time + 1) / 2 * (moments - 1)
+        )
+    else:
+        weights = hats(torch.tensor([time], dtype=torch.float64), moments)[0].numpy()
+        expected = np.einsum("t,actrk->acrk", weights, grid)
+    # the place in time is rounded twice, its error counts as the steepest slope; so is the result,
+    # of which a cubic curve has up to four parts, whose weights are sums of powers
     slope, largest = np.abs(np.diff(grid, axis=2)).max(), np.abs(grid).max()
-    rounding = np.finfo(np.float32).eps * ((moments - 1) * slope + 2 * largest)
-    np.testing.assert_allclose(lines, np.einsum("t,actrk->acrk", weights, grid), atol=rounding)
+    rounding = np.finfo(np.float32).eps * ((moments - 1) * slope + (12 if cubic else 2) * largest)
+    np.testing.assert_allclose(lines, expected, atol=rounding)
     d_lines = rng.normal(size=lines.shape).astype(np.float32)
     for place in chunks:
-        kernels.spread(d_lines, np.float32(time), d_grid, *place)
+        kernels.spread(d_lines, np.float32(time), cubic, d_grid, *place)
     forward, backward = np.vdot(d_lines, lines), np.vdot(d_grid, grid)
     assert forward == pytest.approx(backward, rel=1e-4, abs=1e-4)
 

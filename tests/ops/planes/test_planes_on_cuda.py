@@ -85,6 +85,7 @@ def compare(
     times: Sequence[float],
     beside: int = 0,
     dtype: torch.dtype = torch.float32,
+    degree: int = 1,
 ) -> None:
     half = dtype is not torch.float32
     tolerance = half_tolerance(dtype) if half else TOLERANCE
@@ -92,13 +93,14 @@ def compare(
     ours, exact = leaves(given, torch.float32), leaves(given, torch.float64)
     to_cube = planes.to_cube(BOX).tolist()
     there = [tensor.to(place) for tensor in ours]
-    found = grids.lookup(*there[:2], times, to_cube, there[2:], dtype).cpu()
+    given_times = times, to_cube, there[2:], dtype
+    found = grids.lookup(*there[:2], *given_times, degree=degree).cpu()
     assert found.dtype is torch.float32
     parts = []
     for time in times:
         read = levels_of(exact[2:])
         read = [rounded(level, time, dtype) for level in read] if half else read
-        parts.append(planes.lookup_twin(read, exact[0], time, BOX, exact[1]))
+        parts.append(planes.lookup_twin(read, exact[0], time, BOX, exact[1], degree))
     expected = torch.cat(parts)
     assert_near(found, expected, tolerance, "features")
     slope = torch.randn(expected.shape, generator=generator(5))
@@ -125,6 +127,12 @@ def test_any_number_of_points(place: str, count: int) -> None:
 def test_several_times_at_once(place: str, count: int, times: tuple[float, ...]) -> None:
     """Also where nothing is to be learnt from a point at one time, but from others."""
     compare(place, levels((4, 3, 32), (9, 5, 16)), count, times, beside=3)
+
+
+@pytest.mark.parametrize("nodes", [2, 3, 4, 7])
+def test_cubic_curves_in_time(place: str, nodes: int) -> None:
+    times = (-1.0, -0.9, 0.1, 0.96, 1.0)
+    compare(place, levels((4, nodes, 32), (9, 5, 16)), 33, times, beside=3, degree=3)
 
 
 def test_no_points_have_no_features_and_teach_nothing() -> None:
