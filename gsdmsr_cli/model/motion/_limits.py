@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from gsdmsr_cli.backends.cuda.compiler import MOST_LEVELS
+from gsdmsr_cli.ops.planes import DEGREES
 from gsdmsr_cli.options.strict import require
 
 
@@ -14,6 +15,16 @@ def require_resolutions(options: object, *keys: str) -> None:
     """
     for key in keys:
         require(options, key, getattr(options, key) >= 2, "2 or more")
+
+
+def require_degree(options: object, key: str) -> None:
+    """Check the degree of the B-splines between a plane grid's nodes in time.
+
+    Raises:
+        InvalidError: grids have none of that degree.
+    """
+    within = getattr(options, key) in DEGREES
+    require(options, key, within, " or ".join(map(str, DEGREES)))
 
 
 def require_levels(options: object, key: str, besides: int = 0) -> None:

@@ -22,7 +22,7 @@ from gsdmsr_cli.model.layer import Facts, Instant
 from gsdmsr_cli.model.limits import require_multiples
 from gsdmsr_cli.model.motion._control_points import ControlPoints, require_points
 from gsdmsr_cli.model.motion._grids import sparser_at_ends, time_nodes
-from gsdmsr_cli.model.motion._limits import require_levels
+from gsdmsr_cli.model.motion._limits import require_degree, require_levels
 from gsdmsr_cli.model.motion._rigidity import rigidity
 from gsdmsr_cli.model.parameter import name_parameters
 from gsdmsr_cli.ops import network, planes
@@ -72,7 +72,7 @@ class Options:
         require_levels(self, "levels")
         require_multiples(self, "channels", "width")
         require(self, "time_ends", 0 < self.time_ends <= 1, "above 0, at most 1")
-        require(self, "time_degree", self.time_degree in planes.DEGREES, "1 or 3")
+        require_degree(self, "time_degree")
         require_progress(self, "rigidity_until")
 
 

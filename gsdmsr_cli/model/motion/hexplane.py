@@ -14,7 +14,7 @@ from gsdmsr_cli.gaussians.splats import Splats
 from gsdmsr_cli.model.layer import Facts, Instant, Layer
 from gsdmsr_cli.model.limits import require_multiples
 from gsdmsr_cli.model.motion._grids import split_times, time_nodes
-from gsdmsr_cli.model.motion._limits import require_levels
+from gsdmsr_cli.model.motion._limits import require_degree, require_levels
 from gsdmsr_cli.model.parameter import name_parameters
 from gsdmsr_cli.ops import network, planes
 from gsdmsr_cli.ops.displace import OUTPUTS, PARTS, displace
@@ -28,6 +28,7 @@ class Options:
         levels: resolution of each of 1 to 8 levels along a spatial axis.
         channels: features per level, a multiple of 16.
         time_ratio: resolution in time per distinct train time.
+        time_degree: of the B-splines between the nodes in time, 1 (straight lines) or 3.
         width: width of the network's hidden layers, a multiple of 16.
         heads: "shared" has two hidden layers; in "separate", as in 4D-GS, position, rotation and
             scale have a second hidden layer each.
@@ -38,6 +39,7 @@ class Options:
     levels: tuple[int, ...] = (64, 128)
     channels: int = 32
     time_ratio: float = 0.25
+    time_degree: int = 1
     width: int = 64
     heads: Literal["shared", "separate"] = "shared"
     detach: bool = False
@@ -47,6 +49,7 @@ class Options:
 
     def __post_init__(self) -> None:
         require_levels(self, "levels")
+        require_degree(self, "time_degree")
         require_multiples(self, "channels", "width")
 
 
@@ -67,7 +70,9 @@ class HexPlaneMotion(Layer):
         blocks = [torch.ones(options.width, outputs) for outputs in PARTS]
         self._own = torch.block_diag(*blocks) if separate else None
         super().__init__(
-            name_parameters("grid", self.levels, "planes", planes.TIME_AXES)
+            name_parameters(
+                "grid", self.levels, "planes", planes.TIME_AXES, time_degree=options.time_degree
+            )
             + name_parameters("network", self.layers, "network")
         )
 
@@ -80,9 +85,8 @@ class HexPlaneMotion(Layer):
         splats = moment.splats
         points = splats.means.detach() if self.options.detach else splats.means
         times = [instant.time for instant in instants]
-        features = planes.lookup_at_times(
-            self.levels, points, times, self.facts.box, place=planes.evenly
-        )
+        given = self.levels, points, times, self.facts.box, None
+        features = planes.lookup_at_times(*given, planes.evenly, self.options.time_degree)
         deformations = network.apply_network(self._network(), features)
         parts = split_times(deformations, len(times))
         return [replace(moment, splats=displace(splats, own)) for own in parts]

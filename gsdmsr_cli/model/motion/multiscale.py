@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -22,7 +23,7 @@ from gsdmsr_cli.model.layer import Facts, Instant, Layer
 from gsdmsr_cli.model.limits import require_multiples
 from gsdmsr_cli.model.motion._decoder_smoothness import roughness, some_twice
 from gsdmsr_cli.model.motion._grids import split_times, time_nodes
-from gsdmsr_cli.model.motion._limits import require_levels, require_resolutions
+from gsdmsr_cli.model.motion._limits import require_degree, require_levels, require_resolutions
 from gsdmsr_cli.model.parameter import Parameter, name_parameters
 from gsdmsr_cli.ops import network, planes
 from gsdmsr_cli.ops.displace import OUTPUTS, displace
@@ -42,6 +43,7 @@ class Options:
         levels: resolution of each of the fine grid's 1 to 7 levels along a spatial axis.
         channels: features per level of the fine grid, a multiple of 16.
         time_ratio: the fine grid's resolution in time per distinct train time.
+        time_degree: of the B-splines between both grids' nodes in time, 1 (straight lines) or 3.
         width: width of the decoder's two hidden layers, a multiple of 16.
         pyramid: give the coarse features to the fine decoder as well.
         embedding: features of its own that each splat has, a multiple of 16; 0 as in the method.
@@ -61,6 +63,7 @@ class Options:
     levels: tuple[int, ...] = (16, 32)
     channels: int = 16
     time_ratio: float = 0.2
+    time_degree: int = 1
     width: int = 32
     pyramid: bool = True
     embedding: int = 16
@@ -75,6 +78,7 @@ class Options:
 
     def __post_init__(self) -> None:
         require_levels(self, "levels", besides=1)  # the coarse one
+        require_degree(self, "time_degree")
         require_resolutions(self, "coarse_level")
         require_multiples(self, "channels", "coarse_channels", "width")
         require_multiples(self, "embedding", least=0)
@@ -104,9 +108,15 @@ class MultiscaleMotion(Layer):
         super().__init__(self._named())
 
     def _named(self) -> list[Parameter]:
+        along_time = partial(
+            name_parameters,
+            rate="planes",
+            time_axes=planes.TIME_AXES,
+            time_degree=self.options.time_degree,
+        )
         parameters = (
-            name_parameters("coarse", self.coarse, "planes", planes.TIME_AXES)
-            + name_parameters("fine", self.fine, "planes", planes.TIME_AXES)
+            along_time("coarse", self.coarse)
+            + along_time("fine", self.fine)
             + name_parameters("coarse_decoder", self.coarse_decoder, "network")
             + name_parameters("decoder", self.decoder, "network")
         )
@@ -151,7 +161,7 @@ class MultiscaleMotion(Layer):
     ) -> Tensor:
         points = splats.means.detach() if self.options.detach else splats.means
         given = levels, points, [now.time for now in instants], self.facts.box, embeddings
-        return planes.lookup_at_times(*given, planes.evenly)
+        return planes.lookup_at_times(*given, planes.evenly, self.options.time_degree)
 
     def advance(self, progress: float) -> None:
         """Let the fine field join after ``coarse_until``."""

@@ -790,12 +790,17 @@ def test_control_points_may_have_fewer_nodes_at_both_ends() -> None:
     assert_equal(*still, rtol=1e-5, atol=1e-6)
 
 
-def test_control_points_may_go_along_cubic_curves() -> None:
-    """Their velocity jumps at a node of the grid only where lines lie between nodes."""
+@pytest.mark.parametrize(
+    ("name", "grid"),
+    [("control_points", "grid.0"), ("hexplane", "grid.0"), ("multiscale", "fine.0")],
+)
+def test_grids_may_have_cubic_curves_in_time(name: str, grid: str) -> None:
+    """Velocity jumps at a node of the grid only where lines lie between nodes."""
     splats, jumps = splats_of(COUNT), []
     for degree in (1, 3):
-        motion = disturbed(started("control_points", COUNT, time_degree=degree))
-        nodes = motion.tensors()["grid.0.time"].shape[2]
+        motion = disturbed(started(name, COUNT, time_degree=degree))
+        motion.advance(1.0)
+        nodes = motion.tensors()[f"{grid}.time"].shape[2]
         node, step = 3 / (nodes - 1), 1e-2 / (nodes - 1)
         before, at, after = (
             moved_by(motion, splats, node + shift).means.detach() for shift in (-step, 0.0, step)
@@ -803,11 +808,10 @@ def test_control_points_may_go_along_cubic_curves() -> None:
         jumps.append(float((after - 2 * at + before).norm() / (after - before).norm()))
     linear, cubic = jumps
     assert cubic < 0.1 * linear
-    curved = disturbed(started("control_points", COUNT, time_degree=3))
-    shown = [moved_by(curved, splats, time) for time in (0.4, 0.5, 0.6)]
-    model_of(splats, curved).hold_outside(0.4, 0.6)
+    shown = [moved_by(motion, splats, time) for time in (0.4, 0.5, 0.6)]
+    model_of(splats, motion).hold_outside(0.4, 0.6)
     for time, expected in zip((0.4, 0.5, 0.6), shown, strict=True):
-        assert_equal(moved_by(curved, splats, time), expected, rtol=1e-5, atol=1e-6)
+        assert_equal(moved_by(motion, splats, time), expected, rtol=1e-5, atol=1e-6)
 
 
 def test_control_points_may_move_freely_in_the_end() -> None:
