@@ -99,11 +99,13 @@ def colour(means, sh, count, centre, opacities, colours):
                 continue
             x, y, z, _ = _direction(means, centre, i)
             _basis(x, y, z, count, basis)
-            for channel in range(3):
-                value = _HALF
-                for k in range(count):
-                    value += sh[i, k, channel] * basis[k]
-                colours[i, channel] = max(value, float32(0))
+            red, green, blue = _HALF, _HALF, _HALF  # three sums at once wait less for each other
+            for k in range(count):
+                red += sh[i, k, 0] * basis[k]
+                green += sh[i, k, 1] * basis[k]
+                blue += sh[i, k, 2] * basis[k]
+            colours[i, 0], colours[i, 1] = max(red, float32(0)), max(green, float32(0))
+            colours[i, 2] = max(blue, float32(0))
 
 
 @parallel
