@@ -20,7 +20,7 @@ ROWS = torch.tensor([119, 3, 3, 0, 77])
 @pytest.fixture
 def trainer(tiny_scene: Path) -> Trainer:
     """A training that moves, of 120 splats; what is kept for each is marked by its row."""
-    trainer = trainer_of(tiny_scene, preset_of("density.start=999"))
+    trainer = trainer_of(tiny_scene, preset_of("density.start=999", "splats.sh_degree=1"))
     for _ in range(8):
         trainer.step()
     population = trainer.population
