@@ -37,7 +37,7 @@ DEGREES = 1, 3
 """Of the B-splines that may lie between nodes in time: straight lines, or cubic curves."""
 
 
-def bump(x: Tensor) -> Tensor:
+def _bump(x: Tensor) -> Tensor:
     """Return the uniform cubic B-spline at x nodes from its middle; it is 0 from 2 on."""
     x = x.abs()
     inner, outer = 2 / 3 - x * x * (1 - x / 2), (2 - x).clamp(min=0) ** 3 / 6
@@ -57,7 +57,7 @@ def cubic_weights(place: Tensor, count: int) -> Tensor:
         count: 2 or more.
     """
     at = torch.arange(-1, count + 1, dtype=place.dtype, device=place.device)
-    before, *_, after = own = bump(at - place)
+    before, *_, after = own = _bump(at - place)
     weights: Tensor = own[1:-1].clone()
     weights[0] += 2 * before
     weights[1] -= before
