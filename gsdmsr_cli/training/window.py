@@ -69,6 +69,15 @@ class Window:
         last = min(math.ceil(NEWEST * len(self._nearest)), count)
         return self._nearest[count - 1 - int(torch.randint(last, (), generator=generator))]
 
+    @property
+    def means_rate(self) -> float:
+        """The rate of the splats' positions, in units of the preset's, of the whole training.
+
+        What has to be followed is lost where splats leave their places sooner than the motion
+        learns to take them along.
+        """
+        return 1.0 if self._options.window == 1 else self._options.window_means
+
     def extent(self, progress: float) -> tuple[float, float] | None:
         """Return the first and the last time that may be seen, or None if all may."""
         count = self._count(progress)
