@@ -10,6 +10,7 @@ from pathlib import Path
 import torch
 
 from gsdmsr_cli import raster
+from gsdmsr_cli.drawing.any_size import at_any_size, focal_of
 from gsdmsr_cli.evaluation.protocol import ViewRenderer
 from gsdmsr_cli.formats import read_scene
 from gsdmsr_cli.ground import say
@@ -70,7 +71,7 @@ def open_trained(
         scene = run.part_of(read_scene(place))
         if verify:
             check_whole(run.root, scene)
-        renderer, device = _renderer(run, model, background, downscale)
+        renderer, device = _renderer(run, model, scene, background, downscale)
         yield Trained(run, checkpoint, _so_far(run, scene), renderer, device)
 
 
@@ -87,17 +88,19 @@ def _so_far(run: Run, scene: Scene) -> Scene:
 
 
 def _renderer(
-    run: Run, model: Model, background: str | None, downscale: int | None
+    run: Run, model: Model, scene: Scene, background: str | None, downscale: int | None
 ) -> tuple[ViewRenderer, str]:
-    """Return what draws a model, and where."""
+    """Return what draws a model, at whatever size, and where."""
     # torch's own threads would wait busily between its small operations and take the kernels' cores
     torch.set_num_threads(1)
     options = run.preset.data
     colour = BACKGROUNDS[background or options.background]
     pictures = Pictures(colour, downscale or options.downscale, options.cache_mib << 20)
     device = raster.pick_device("auto")
+    focals = [focal_of(view.camera) / options.downscale for view in scene.split("train")]
+    engine = at_any_size(raster.best_engine(device), focals)
     behind = torch.tensor(colour).to(device)
-    return ViewRenderer(model.to(device), raster.best_engine(device), pictures, behind), device
+    return ViewRenderer(model.to(device), engine, pictures, behind), device
 
 
 def _place_of_data(run: Run, data: Path | None) -> Path:

@@ -30,6 +30,8 @@ from gsdmsr_cli.scene.scene import MASK, MOVING, View
 
 CONVENTIONS = {
     "renders": "clamped to [0, 1] and rounded to 8 bits; psnr_float is of unrounded ones",
+    "sizes": "views of other sizes than in training look as those of training, with the low-pass "
+    "of its pixels; smaller ones are drawn as finely as there and averaged",
     "psnr": f"of the mean squared error over all pixels and channels, at most {PSNR_CAP:g} dB",
     "psnr_fitted": "after the affine transform of the drawn colours that is best for the picture",
     "ssim": "11 x 11 Gaussian window of sigma 1.5 px, zero padding, mean over all pixels",
