@@ -22,7 +22,7 @@ def learning_rates(
     progress: float,
     begins: float,
     radius: float,
-    means_rate: float = 1.0,
+    pace: float = 1.0,
 ) -> dict[str, float]:
     """Return the learning rate of each trained parameter by its name.
 
@@ -32,11 +32,11 @@ def learning_rates(
         progress: in [0, 1].
         begins: progress at which the schedules begin.
         radius: of the scene [world units].
-        means_rate: factor on the rate of positions.
+        pace: factor on the preset's rates.
     """
     p = (progress - begins) / (1 - begins) if begins < 1 else 0.0
-    named = {name: log_linear(getattr(options, name), p) for name in NAMED}
-    named[_RADII] *= radius * means_rate
+    named = {name: pace * log_linear(getattr(options, name), p) for name in NAMED}
+    named[_RADII] *= radius
     return {
         one.name: named[one.rate] if isinstance(one.rate, str) else log_linear(one.rate, p)
         for one in parameters

@@ -347,7 +347,7 @@ class Trainer:
         static = self.preset.training.static_until
         rates = learning_rates(
             self.model.parameters(), self.preset.optimizer, progress, static, self.scene.radius,
-            self.window.means_rate,
+            self.window.pace,
         )  # fmt: skip
         share = self.preset.optimizer.sh_rest
         rest = self.model.splats.sh.detach()[:, 1:]
