@@ -87,15 +87,10 @@ def _with_low_pass(moment: Moment, camera: Camera, variance: float) -> Moment:
     if moment.axes is not None:
         unit = torch.eye(3).to(moment.axes)
         covariances = moment.axes @ moment.axes.mT + added[:, None, None] * unit
-        return replace(moment, axes=_roots(covariances))
+        roots, failed = torch.linalg.cholesky_ex(covariances)  # thin ones may be too thin for it
+        return replace(moment, axes=torch.where((failed == 0)[:, None, None], roots, moment.axes))
     log_scales = 0.5 * torch.logaddexp(2 * splats.log_scales, added.log()[:, None])
     return replace(moment, splats=replace(splats, log_scales=log_scales))
-
-
-def _roots(covariances: Tensor) -> Tensor:
-    """Return A of A A^T, (N, 3, 3); what is not finite stays so."""
-    roots, failed = torch.linalg.cholesky_ex(covariances)
-    return torch.where((failed == 0)[:, None, None], roots, torch.nan)
 
 
 def _mean_of_squares(frame: Frame, times: int) -> Frame:
