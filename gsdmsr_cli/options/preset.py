@@ -126,8 +126,6 @@ class TrainingOptions:
         window_at: the time about which they lie, 0 to 1.
         window_newest: share of the views of steps that are drawn, as long as not all are seen, from
             the tenth of all views that has come last, 0 to 1.
-        window_rates: factor on all learning rates of ``optimizer`` where not all are seen from the
-            start, above 0, at most 1.
         average_from: progress from which the result is the mean of the steps' values; 1 is never.
         checkpoint_minutes: time between checkpoints [min].
         keep: how many of the last checkpoints are kept.
@@ -151,7 +149,6 @@ class TrainingOptions:
     window_until: float = 0.3
     window_at: float = 0.5
     window_newest: float = 0.0
-    window_rates: float = 1.0
     average_from: float = 0.9
     checkpoint_minutes: float = 2.0
     keep: int = 1
@@ -172,7 +169,6 @@ class TrainingOptions:
         require(self, "window", 0 < self.window <= 1, "a share above 0, up to 1")
         require(self, "window_at", 0 <= self.window_at <= 1, "a time from 0 to 1")
         require(self, "window_newest", 0 <= self.window_newest <= 1, "a share from 0 to 1")
-        require(self, "window_rates", 0 < self.window_rates <= 1, "a share above 0, up to 1")
         require_positive(self, "checkpoint_minutes")
         require(self, "seed", 0 <= self.seed < 2**32, "0 to 4294967295")
         require_at_least(self, 0, "static_steps", "threads", "tiles_per_view")

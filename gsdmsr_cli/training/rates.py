@@ -22,7 +22,6 @@ def learning_rates(
     progress: float,
     begins: float,
     radius: float,
-    pace: float = 1.0,
 ) -> dict[str, float]:
     """Return the learning rate of each trained parameter by its name.
 
@@ -32,10 +31,9 @@ def learning_rates(
         progress: in [0, 1].
         begins: progress at which the schedules begin.
         radius: of the scene [world units].
-        pace: factor on the preset's rates.
     """
     p = (progress - begins) / (1 - begins) if begins < 1 else 0.0
-    named = {name: pace * log_linear(getattr(options, name), p) for name in NAMED}
+    named = {name: log_linear(getattr(options, name), p) for name in NAMED}
     named[_RADII] *= radius
     return {
         one.name: named[one.rate] if isinstance(one.rate, str) else log_linear(one.rate, p)

@@ -346,9 +346,8 @@ class Trainer:
         gates = {} if gated is None else gates_of(self.population, self.clock.step)
         static = self.preset.training.static_until
         rates = learning_rates(
-            self.model.parameters(), self.preset.optimizer, progress, static, self.scene.radius,
-            self.window.pace,
-        )  # fmt: skip
+            self.model.parameters(), self.preset.optimizer, progress, static, self.scene.radius
+        )
         share = self.preset.optimizer.sh_rest
         rest = self.model.splats.sh.detach()[:, 1:]
         before = None if share == 1 else rest.clone()

@@ -69,15 +69,6 @@ class Window:
         last = min(math.ceil(NEWEST * len(self._nearest)), count)
         return self._nearest[count - 1 - int(torch.randint(last, (), generator=generator))]
 
-    @property
-    def pace(self) -> float:
-        """The factor on the preset's learning rates, of the whole training.
-
-        What has to be followed is lost where splats change sooner than the motion learns to take
-        them along.
-        """
-        return 1.0 if self._options.window == 1 else self._options.window_rates
-
     def extent(self, progress: float) -> tuple[float, float] | None:
         """Return the first and the last time that may be seen, or None if all may."""
         count = self._count(progress)

@@ -40,13 +40,5 @@ def test_schedules_fall_from_where_they_begin(progress: float, begins: float, sh
     assert found == pytest.approx(expected, rel=1e-12)
 
 
-def test_the_pace_is_of_the_presets_rates() -> None:
-    parameters = [Parameter(name, torch.zeros(2), rate=name) for name in ("means", "planes")]
-    parameters.append(Parameter("its own", torch.zeros(2), rate=(1.0, 0.01)))
-    found = learning_rates(parameters, OPTIONS, 0.0, 0.0, RADIUS, pace=0.25)
-    expected = {"means": 0.16 * RADIUS / 4, "planes": 0.01 / 4, "its own": 1.0}
-    assert found == pytest.approx(expected, rel=1e-12)
-
-
 def test_a_training_that_is_static_to_its_end_keeps_its_first_rates() -> None:
     assert rates_at(1.0, 1.0)["a planes"] == pytest.approx(0.01, rel=1e-12)

@@ -144,31 +144,9 @@ def test_a_training_draws_what_came_last(tiny_scene: Path) -> None:
     assert {trainer.views[row].time for row in rows} == set(times)
 
 
-def test_splats_change_slower_where_there_is_a_window(tiny_scene: Path) -> None:
-    """Adam's first step is as long as the rate, whatever the gradient."""
-    options = "training.window=0.25", "training.window_until=0.5", "training.static_until=0"
-    moved = {}
-    for rate in (1.0, 0.25):
-        further = "training.window_if=always", f"training.window_rates={rate}"
-        trainer = trainer_of(tiny_scene, preset_of(*options, *further))
-        before = trainer.model.splats.means.detach().clone()
-        trainer.step()
-        moved[rate] = trainer.model.splats.means.detach() - before
-    assert moved[1.0].abs().max() > 0
-    torch.testing.assert_close(moved[0.25], moved[1.0] / 4, rtol=1e-2, atol=2e-7)
-
-
-def test_rates_are_the_presets_without_a_window() -> None:
-    assert Window(TIMES, TrainingOptions(window=0.5, window_rates=0.25)).pace == 0.25
-    assert Window(TIMES, TrainingOptions(window_rates=0.25)).pace == 1.0
-    still = Window([0.3] * 6, TrainingOptions(window=0.5, window_rates=0.25))
-    assert still.pace == 1.0, "all show the same moment"
-
-
 @pytest.mark.parametrize(
     ("option", "message"),
     [
-        ("training.window_rates=0", "window_rates is 0.0; allowed: a share above 0, up to 1"),
         ("training.window=0", "window is 0.0; allowed: a share above 0, up to 1"),
         ("training.window_at=1.5", "window_at is 1.5; allowed: a time from 0 to 1"),
         ("training.window_until=2", "window_until"),
