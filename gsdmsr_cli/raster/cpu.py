@@ -222,7 +222,7 @@ class _Blend(Function):
     ) -> tuple[Tensor, Tensor]:
         width, height = size
         rows, columns = tile_grid(width, height)
-        records = np.empty((len(means2d), blending.RECORD), np.float32)
+        records = array(torch.empty(len(means2d), blending.RECORD))  # torch's begin cache lines
         screen = [array(t) for t in (means2d, conics, opacities)]
         blending.pack(bins.splats, *screen, array(colours.contiguous()), records)
         rgb = torch.empty(3, rows * TILE, columns * TILE)
@@ -244,7 +244,7 @@ class _Blend(Function):
         conics, opacities = ctx.saved_tensors
         bins, (rgb, alpha) = ctx.bins, ctx.padded
         n = len(conics)
-        sums = np.empty((blending.PARTS, n, blending.RECORD), np.float32)
+        sums = array(torch.empty(blending.PARTS, n, blending.RECORD))
         d_rgb = torch.zeros_like(rgb) if d_rgb is None else padded(d_rgb, rgb.shape)
         if d_alpha is None:
             d_alpha = torch.empty(0, 0)

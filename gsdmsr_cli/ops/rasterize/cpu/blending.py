@@ -32,6 +32,9 @@ PARTS = 4
 """Parts of the picture whose gradients are summed apart, and so the most threads of the backward
 pass. A fixed number: then the sums do not depend on how many threads there are."""
 
+_AHEAD = 8
+"""How many entries before its turn a splat's record is asked for, which may lie in slow memory."""
+
 _LOG2E = float32(math.log2(math.e))
 _ALPHA_MIN = float32(ALPHA_MIN)
 _ALPHA_MAX = float32(ALPHA_MAX)
@@ -105,6 +108,7 @@ def _make_draw(keep: bool) -> Any:
             if keep:
                 ranges[(k - start) >> 4, 0], ranges[(k - start) >> 4, 1] = top, bottom
             i, rows = entries[k, 0], entries[k, 1]
+            simd.prefetch(records, entries[min(k + _AHEAD, end - 1), 0] * RECORD)
             k += 1
             dx = simd.iota(x0 - records[i, 0])
             at_row = dx * dx * records[i, 2] + simd.splat(records[i, 5])
@@ -157,6 +161,9 @@ def _make_differentiate(from_kept: bool) -> Any:
             elif ((k - start) & 15) == 0 and k > start:
                 top, bottom = _unfinished_rows(block, top, bottom)
             i, rows = entries[k, 0], entries[k, 1]
+            later = entries[min(k + _AHEAD, end - 1), 0] * RECORD
+            simd.prefetch(records, later)
+            simd.prefetch(own, later)
             dx = simd.iota(x0 - records[i, 0])
             at_row = dx * dx * records[i, 2] + simd.splat(records[i, 5])
             slope, curve = dx * records[i, 3], records[i, 4]

@@ -8,6 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from gsdmsr_cli.backends.cpu.jit import serial
+from gsdmsr_cli.backends.cpu.simd import empty_aligned
 from gsdmsr_cli.ground.splatting_constants import TILE
 from gsdmsr_cli.ops.photometric.cpu import compare
 from gsdmsr_cli.ops.rasterize.cpu.binning import assign, leave_out
@@ -52,10 +53,10 @@ def look(
     entries, starts, busiest, order = assign(
         means2d, conics, depths, opacities, tiles, width, height, threads
     )
-    records = np.empty((n, RECORD), np.float32)
+    records = empty_aligned(n * RECORD).reshape(n, RECORD)
     pack(order, means2d, conics, opacities, colours, records)
     columns, rows = (width + TILE - 1) // TILE, (height + TILE - 1) // TILE
-    sums = np.empty((PARTS, n, RECORD), np.float32)
+    sums = empty_aligned(PARTS * n * RECORD).reshape(PARTS, n, RECORD)
     if ssim_weight > 0:
         rgb = np.empty((3, rows * TILE, columns * TILE), np.float32)
         alpha = np.empty((rows * TILE, columns * TILE), np.float32)
