@@ -133,8 +133,8 @@ def prefetch(_typing: Any, array: Any, index: Any) -> Any:
 
     def emit(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         at = context.cast(builder, args[1], sig.args[1], types.intp)
-        data = context.make_array(sig.args[0])(context, builder, args[0]).data
-        pointer = builder.bitcast(builder.gep(data, [at]), ir.IntType(8).as_pointer())
+        address = _address(context, builder, sig.args[0], args[0], at)
+        pointer = builder.bitcast(address, ir.IntType(8).as_pointer())
         for_reading, keep, of_data = (ir.Constant(_INT, value) for value in (0, 3, 1))
         kind = ir.FunctionType(ir.VoidType(), [pointer.type, _INT, _INT, _INT])
         function = cgutils.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0")
