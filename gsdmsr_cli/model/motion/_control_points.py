@@ -110,9 +110,6 @@ class ControlPoints(Layer):
         near = self._neighbours(moment.splats.means)
         return self.control_points, self.log_radii, transforms, near
 
-    def _transforms(self, points: Tensor, time: float) -> Tensor:
-        return skin.transforms(points, self._deformation(points, time))
-
     def _neighbours(self, means: Tensor) -> Tensor:
         """Return which control points splats follow, (N, K) int32.
 

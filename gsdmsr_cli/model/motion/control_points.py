@@ -24,8 +24,9 @@ from gsdmsr_cli.model.motion._control_points import ControlPoints, require_point
 from gsdmsr_cli.model.motion._grids import sparser_at_ends, time_nodes
 from gsdmsr_cli.model.motion._limits import require_degree, require_levels
 from gsdmsr_cli.model.motion._rigidity import rigidity
+from gsdmsr_cli.model.motion._time_offsets import TimeOffsets
 from gsdmsr_cli.model.parameter import name_parameters
-from gsdmsr_cli.ops import network, planes
+from gsdmsr_cli.ops import network, planes, skin
 from gsdmsr_cli.ops.displace import OUTPUTS
 from gsdmsr_cli.options.strict import require, require_progress
 
@@ -45,6 +46,7 @@ class Options:
             an even grid: above 0, at most 1.
         time_degree: of the B-splines between them, 1 (straight lines) or 3 (cubic curves, whose
             velocity and acceleration do not jump).
+        time_offsets: whether it is learnt at which time each frame was taken, beside what it says.
         width: width of the network's two hidden layers, a multiple of 16.
         space_smoothness, time_smoothness, time_stillness: weights of the plane regularisers.
         rigidity: weight of the control points' deviation from rigid motion.
@@ -60,6 +62,7 @@ class Options:
     time_ratio: float = 0.2
     time_ends: float = 1.0
     time_degree: int = 1
+    time_offsets: bool = False
     width: int = 32
     space_smoothness: float = 1e-4
     time_smoothness: float = 1e-2
@@ -79,14 +82,18 @@ class Options:
 class ControlPointMotion(ControlPoints):
     """Control points with radii, whose displacement, rotation and scaling a plane grid gives."""
 
-    constants = ()
+    constants: Sequence[str] | None = ()
 
     def __init__(self, options: Options, facts: Facts, generator: torch.Generator) -> None:
         super().__init__(options.count, options.neighbours, options.gather, facts, generator)
         self.options = options
         self._rigidity = options.rigidity
         times = time_nodes(facts.frames, options.time_ratio)
-        self._place = sparser_at_ends(options.time_ends)
+        self._offsets: TimeOffsets | None = None
+        if options.time_offsets and facts.frames > 1:
+            self._offsets = TimeOffsets(facts.frames)
+            self.constants = None  # the times at which the grid is read change as it trains
+        self._denser = sparser_at_ends(options.time_ends)
         self.levels = planes.new_levels(options.levels, times, options.channels, generator)
         widths = [options.channels * len(options.levels), options.width, options.width, OUTPUTS]
         self.layers = network.new_network(widths, generator)
@@ -96,6 +103,8 @@ class ControlPointMotion(ControlPoints):
             ),
             *name_parameters("network", self.layers, "network"),
         )
+        if self._offsets is not None:
+            self._parameters += (*self._offsets.parameters("time_offsets"),)
 
     def advance(self, progress: float) -> None:
         """Enter the phase of training that belongs to ``progress`` in [0, 1]."""
@@ -106,6 +115,12 @@ class ControlPointMotion(ControlPoints):
             self._rigidity = o.rigidity * min(max(left, 0.0), 1.0)
 
     def _deformations(self, points: Tensor, times: Sequence[float]) -> Tensor:
+        """Return the outputs for points at the times that frames of these times were taken at."""
+        if self._offsets is None:
+            return self._outputs(points, times)
+        return self._offsets.follow(lambda taken: self._outputs(points, taken), times)
+
+    def _outputs(self, points: Tensor, times: Sequence[float]) -> Tensor:
         """Return the outputs for points; times [0, 1] are mapped to the whole grid, [-1, 1]."""
         given = self.levels, points, times, self.facts.box
         features = planes.lookup_at_times(
@@ -113,6 +128,10 @@ class ControlPointMotion(ControlPoints):
         )
         outputs = network.apply_network(self.layers, features)
         return outputs.view(len(times), len(points), OUTPUTS)
+
+    def _place(self, time: float) -> float:
+        """Return where in [0, 1] a time lies along the grid's axis of time."""
+        return self._denser(time if self._offsets is None else self._offsets.inside(time))
 
     def _on_grid(self, time: float) -> float:
         return planes.evenly(self._place(time))
@@ -129,12 +148,14 @@ class ControlPointMotion(ControlPoints):
         points = self.control_points.detach()
         near = self._pairs.find(points, points)
         time = float(torch.rand((), generator=generator))
-        transforms = self._transforms(points, time)
+        transforms = skin.transforms(points, self._outputs(points, [time])[0])
         return value + self._rigidity * rigidity(points, transforms, near)
 
     def check(self) -> None:
-        """Raise ValueError unless control points, grid and network fit together."""
+        """Raise ValueError unless control points, grid, network and offsets fit together."""
         super().check()
+        if self._offsets is not None:
+            self._offsets.check(self.facts.frames)
         planes.check_levels(self.levels)
         network.check_network(self.layers, planes.features_of(self.levels), OUTPUTS)
 
