@@ -101,7 +101,7 @@ class Layer(ABC):
     needs_jitter: bool = False
     shades: ClassVar[bool] = False
     holds_views: ClassVar[bool] = False
-    constants: Sequence[str] | None = None
+    constants: ClassVar[Sequence[str] | None] = None
 
     def __init__(self, parameters: Sequence[Parameter] = ()) -> None:
         self._parameters = tuple(parameters)

@@ -21,6 +21,7 @@ from gsdmsr_cli.ops import hash_grid, network, planes, precision
 from gsdmsr_cli.ops import skin as skinning
 from gsdmsr_cli.ops.adam.cuda import Row, adam
 from gsdmsr_cli.ops.cube_map import show_behind
+from gsdmsr_cli.ops.hats import hats
 from gsdmsr_cli.ops.nearest import nearest_points
 from gsdmsr_cli.ops.series import add_series
 from gsdmsr_cli.ops.slices import slices
@@ -183,6 +184,10 @@ def _add_series(device: str, dtype: torch.dtype) -> Values:
     return _with_gradients(added, ("starts", "coefficients", "bases"), leaves)
 
 
+def _share(device: str, dtype: torch.dtype) -> Values:
+    return {"shares": hats([0.0, 0.3, 1.0], torch.zeros(_COUNT, device=device, dtype=dtype))}
+
+
 def _slice(device: str, dtype: torch.dtype) -> Values:
     quats, log_scales, tilts = (_random(_COUNT, width, seed=width) for width in (4, 3, 4))
     leaves = _leaves(device, dtype, quats, log_scales, 1 + tilts, _random(_COUNT, seed=1))
@@ -255,6 +260,7 @@ OPERATIONS = {
     "skinning splats": _Operation(_skin, FLOAT32),
     "displacing splats": _Operation(_displace, FLOAT32),
     "adding series": _Operation(_add_series, FLOAT32),
+    "shares of nodes in time": _Operation(_share, FLOAT32),
     "slices of Gaussians in time": _Operation(_slice, FLOAT32),
     "colours behind splats": _Operation(_show_behind, FLOAT32),
     "a network": _Operation(_apply_network, FLOAT32),

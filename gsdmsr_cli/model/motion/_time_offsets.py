@@ -12,11 +12,15 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
-from gsdmsr_cli.model.motion._grids import between
+from gsdmsr_cli.backends.cuda import recording
 from gsdmsr_cli.model.parameter import Parameter
+from gsdmsr_cli.ops.hats import hats
 
 _AROUND = -0.25, 0.25
 """The two times of which a motion's slope is taken, after that of the slope [frames]."""
+
+Clock = Callable[[float], float]
+"""Says at which time a frame of a time was taken."""
 
 
 class TimeOffsets:
@@ -34,10 +38,15 @@ class TimeOffsets:
         """
         self.values = torch.zeros(frames)
         self._frame = 1 / (frames - 1)
+        self._known: list[float] = self.values.tolist()
 
     def parameters(self, name: str) -> Sequence[Parameter]:
         """Return the offsets as what is trained, under a name."""
         return (Parameter(name, self.values, rate="embeddings", time_axis=0),)
+
+    def refresh(self) -> None:
+        """Read the values as they are now, for steps that are replayed."""
+        self._known = self.values.tolist()
 
     def inside(self, time: float) -> float:
         """Return where in [0, 1] a time lies that may be a frame before 0 or after 1.
@@ -46,30 +55,38 @@ class TimeOffsets:
         """
         return min(max((time + self._frame) / (1 + 2 * self._frame), 0.0), 1.0)
 
-    def follow(self, motion: Callable[[Sequence[float]], Tensor], times: Sequence[float]) -> Tensor:
-        """Return what a motion is at the times T that frames were taken at, (T, ...).
+    def follow(self, motion: Callable[[Clock], Tensor], times: Sequence[float]) -> Tensor:
+        """Return what a motion is when the frames of T times were taken, (T, ...).
 
         The gradient of an offset is that of its time by the motion's central difference.
 
         Args:
-            motion: returns (T, ...) at any times.
+            motion: returns (T, ...) at the times to which a clock takes ``times``.
             times: what the frames say, in [0, 1].
         """
-        offsets = torch.stack([between(self.values, time) for time in times])
-        taken = self._later(times, offsets.tolist())
-        values = motion(taken)
+        if not recording.is_recording():  # a stream that is recorded cannot be waited for
+            self.refresh()
+        values = motion(self._clock(0.0))
         if not torch.is_grad_enabled():
             return values
         with torch.no_grad():
-            around = [self._later(taken, [by] * len(taken)) for by in _AROUND]
-            before, after = motion([*around[0], *around[1]]).chunk(2)
+            before, after = (motion(self._clock(by)) for by in _AROUND)
             slopes = (after - before) / (_AROUND[1] - _AROUND[0])
+        offsets = hats(times, self.values) @ self.values
         zeros = offsets - offsets.detach()
         return values + zeros.view(-1, *[1] * (values.dim() - 1)) * slopes
 
-    def _later(self, times: Sequence[float], offsets: Sequence[float]) -> list[float]:
-        """Return the times plus offsets in frames."""
-        return [time + by * self._frame for time, by in zip(times, offsets, strict=True)]
+    def _clock(self, later: float) -> Clock:
+        """Return the clock of the offsets, and by how many frames it is later than that."""
+
+        def taken(time: float) -> float:
+            place = min(max(time, 0.0), 1.0) * (len(self._known) - 1)
+            before = min(int(place), len(self._known) - 2)
+            share, near = place - before, self._known[before : before + 2]
+            offset = (1 - share) * near[0] + share * near[1]
+            return time + (offset + later) * self._frame
+
+        return taken
 
     def check(self, frames: int) -> None:
         """Raise ValueError unless there is one for each frame."""

@@ -24,11 +24,11 @@ from gsdmsr_cli.model.motion._control_points import ControlPoints, require_point
 from gsdmsr_cli.model.motion._grids import sparser_at_ends, time_nodes
 from gsdmsr_cli.model.motion._limits import require_degree, require_levels
 from gsdmsr_cli.model.motion._rigidity import rigidity
-from gsdmsr_cli.model.motion._time_offsets import TimeOffsets
+from gsdmsr_cli.model.motion._time_offsets import Clock, TimeOffsets
 from gsdmsr_cli.model.parameter import name_parameters
 from gsdmsr_cli.ops import network, planes, skin
 from gsdmsr_cli.ops.displace import OUTPUTS
-from gsdmsr_cli.options.strict import require, require_progress
+from gsdmsr_cli.options.strict import require, require_at_least, require_progress
 
 
 @dataclass(frozen=True)
@@ -47,6 +47,7 @@ class Options:
         time_degree: of the B-splines between them, 1 (straight lines) or 3 (cubic curves, whose
             velocity and acceleration do not jump).
         time_offsets: whether it is learnt at which time each frame was taken, beside what it says.
+        time_offset_weight: weight of the mean square of these offsets [1 / frame^2].
         width: width of the network's two hidden layers, a multiple of 16.
         space_smoothness, time_smoothness, time_stillness: weights of the plane regularisers.
         rigidity: weight of the control points' deviation from rigid motion.
@@ -63,6 +64,7 @@ class Options:
     time_ends: float = 1.0
     time_degree: int = 1
     time_offsets: bool = False
+    time_offset_weight: float = 1e-3
     width: int = 32
     space_smoothness: float = 1e-4
     time_smoothness: float = 1e-2
@@ -76,13 +78,14 @@ class Options:
         require_multiples(self, "channels", "width")
         require(self, "time_ends", 0 < self.time_ends <= 1, "above 0, at most 1")
         require_degree(self, "time_degree")
+        require_at_least(self, 0, "time_offset_weight")
         require_progress(self, "rigidity_until")
 
 
 class ControlPointMotion(ControlPoints):
     """Control points with radii, whose displacement, rotation and scaling a plane grid gives."""
 
-    constants: Sequence[str] | None = ()
+    constants = ()
 
     def __init__(self, options: Options, facts: Facts, generator: torch.Generator) -> None:
         super().__init__(options.count, options.neighbours, options.gather, facts, generator)
@@ -92,7 +95,6 @@ class ControlPointMotion(ControlPoints):
         self._offsets: TimeOffsets | None = None
         if options.time_offsets and facts.frames > 1:
             self._offsets = TimeOffsets(facts.frames)
-            self.constants = None  # the times at which the grid is read change as it trains
         self._denser = sparser_at_ends(options.time_ends)
         self.levels = planes.new_levels(options.levels, times, options.channels, generator)
         widths = [options.channels * len(options.levels), options.width, options.width, OUTPUTS]
@@ -109,23 +111,30 @@ class ControlPointMotion(ControlPoints):
     def advance(self, progress: float) -> None:
         """Enter the phase of training that belongs to ``progress`` in [0, 1]."""
         super().advance(progress)
+        if self._offsets is not None:
+            self._offsets.refresh()
         o = self.options
         if o.rigidity_until:
             left = 2 * (1 - progress / o.rigidity_until)
             self._rigidity = o.rigidity * min(max(left, 0.0), 1.0)
 
     def _deformations(self, points: Tensor, times: Sequence[float]) -> Tensor:
-        """Return the outputs for points at the times that frames of these times were taken at."""
+        """Return the outputs for points when the frames of these times were taken."""
         if self._offsets is None:
-            return self._outputs(points, times)
-        return self._offsets.follow(lambda taken: self._outputs(points, taken), times)
+            return self._outputs(points, times, planes.as_given)
+        return self._offsets.follow(lambda clock: self._outputs(points, times, clock), times)
 
-    def _outputs(self, points: Tensor, times: Sequence[float]) -> Tensor:
-        """Return the outputs for points; times [0, 1] are mapped to the whole grid, [-1, 1]."""
+    def _outputs(self, points: Tensor, times: Sequence[float], clock: Clock) -> Tensor:
+        """Return the outputs for points at the times to which a clock takes ``times``.
+
+        The times from 0 to 1 are mapped to the whole grid, [-1, 1].
+        """
+
+        def on_grid(time: float) -> float:
+            return planes.evenly(self._place(clock(time)))
+
         given = self.levels, points, times, self.facts.box
-        features = planes.lookup_at_times(
-            *given, place=self._on_grid, degree=self.options.time_degree
-        )
+        features = planes.lookup_at_times(*given, place=on_grid, degree=self.options.time_degree)
         outputs = network.apply_network(self.layers, features)
         return outputs.view(len(times), len(points), OUTPUTS)
 
@@ -133,22 +142,21 @@ class ControlPointMotion(ControlPoints):
         """Return where in [0, 1] a time lies along the grid's axis of time."""
         return self._denser(time if self._offsets is None else self._offsets.inside(time))
 
-    def _on_grid(self, time: float) -> float:
-        return planes.evenly(self._place(time))
-
     def penalty(self, moment: Moment, instant: Instant, generator: torch.Generator) -> Tensor:
-        """Return the plane regularisers, and the rigidity of control points at a random time.
+        """Return the regularisers of planes and offsets, and the rigidity at a random time.
 
         The rigidity has gradients for the grid and the network, none for the control points.
         """
         o = self.options
         value = planes.penalty(self.levels, o.space_smoothness, o.time_smoothness, o.time_stillness)
+        if self._offsets is not None:
+            value = value + o.time_offset_weight * self._offsets.values.square().mean()
         if not self._rigidity:
             return value
         points = self.control_points.detach()
         near = self._pairs.find(points, points)
         time = float(torch.rand((), generator=generator))
-        transforms = skin.transforms(points, self._outputs(points, [time])[0])
+        transforms = skin.transforms(points, self._outputs(points, [time], planes.as_given)[0])
         return value + self._rigidity * rigidity(points, transforms, near)
 
     def check(self) -> None:

@@ -13,15 +13,19 @@ from torch import Tensor
 
 from gsdmsr_cli.gaussians.moment import Moment
 from gsdmsr_cli.model.layer import Instant
-from gsdmsr_cli.model.motion._time_offsets import TimeOffsets
+from gsdmsr_cli.model.motion._time_offsets import Clock, TimeOffsets
 
 COUNT = 7
 
 
-def along_a_parabola(times: Sequence[float]) -> Tensor:
+def along_a_parabola(times: Sequence[float], clock: Clock = float) -> Tensor:
     """Return 2 t^2 - t and 3 t at each time, (T, 1, 2): central differences of it are exact."""
-    t = torch.tensor(times)
+    t = torch.tensor([clock(time) for time in times])
     return torch.stack([2 * t * t - t, 3 * t], dim=1)[:, None]
+
+
+def followed(offsets: TimeOffsets, times: Sequence[float]) -> Tensor:
+    return offsets.follow(lambda clock: along_a_parabola(times, clock), times)
 
 
 def offsets_of(*values: float) -> TimeOffsets:
@@ -35,15 +39,14 @@ def offsets_of(*values: float) -> TimeOffsets:
 def test_a_frame_is_as_the_motion_is_when_it_was_taken() -> None:
     offsets = offsets_of(0.0, 0.5, -1.0, 0.0, 0.25)  # frames are 0.25 apart
     with torch.no_grad():
-        found = offsets.follow(along_a_parabola, [0.25, 0.5, 0.375, 1.0])
+        found = followed(offsets, [0.25, 0.5, 0.375, 1.0])
     taken = [0.25 + 0.125, 0.5 - 0.25, 0.375 - 0.0625, 1.0 + 0.0625]
     torch.testing.assert_close(found, along_a_parabola(taken))
 
 
 def test_the_gradient_of_an_offset_is_that_of_the_time() -> None:
     offsets, weights = offsets_of(0.0, 0.5, -1.0, 0.0, 0.25), torch.tensor([[[0.7, -0.2]]])
-    found = offsets.follow(along_a_parabola, [0.25, 0.625])
-    (found * weights).sum().backward()
+    (followed(offsets, [0.25, 0.625]) * weights).sum().backward()
     t, u = 0.375, 0.625 - 0.5 * 0.25
     slopes = [0.25 * (0.7 * (4 * s - 1) - 0.2 * 3) for s in (t, u)]
     expected = torch.tensor([0.0, slopes[0], slopes[1] / 2, slopes[1] / 2, 0.0])
@@ -64,7 +67,7 @@ def test_frames_that_were_taken_at_other_times_are_found() -> None:
     optimiser = torch.optim.Adam([offsets.values], lr=0.02)
     for _ in range(200):
         optimiser.zero_grad()
-        (offsets.follow(along_a_parabola, times) - shown).square().sum().backward()
+        (followed(offsets, times) - shown).square().sum().backward()
         optimiser.step()
     torch.testing.assert_close(offsets.values.detach(), true, atol=1e-3, rtol=0)
 
@@ -101,11 +104,13 @@ def test_the_offsets_of_control_points_have_the_gradient_of_the_splats_places(de
 
 
 def test_the_rigidity_tells_offsets_nothing() -> None:
-    motion = disturbed(started("control_points", COUNT, time_offsets=True))
+    given = {"time_offsets": True, "time_offset_weight": 0.0}
+    motion = disturbed(started("control_points", COUNT, **given))
     value = motion.penalty(Moment(splats_of(COUNT)), Instant(0.5), generator())
     assert value is not None
     value.backward()
-    assert motion.tensors()["time_offsets"].grad is None
+    slopes = motion.tensors()["time_offsets"].grad
+    assert slopes is not None and not slopes.any()
 
 
 def test_a_scene_of_one_moment_has_no_offsets() -> None:
@@ -122,6 +127,32 @@ def test_a_checkpoint_needs_an_offset_for_each_frame() -> None:
         motion.check()
 
 
-def test_replays_are_left_where_times_are_learnt() -> None:
-    assert started("control_points", COUNT).constants == ()
-    assert started("control_points", COUNT, time_offsets=True).constants is None
+def test_offsets_cost_their_mean_square() -> None:
+    """Beside what the rest of the motion costs, with a weight."""
+    values = []
+    for weight in (0.0, 0.5):
+        given = {"time_offsets": True, "time_offset_weight": weight}
+        motion = disturbed(started("control_points", COUNT, **given))
+        value = motion.penalty(Moment(splats_of(COUNT)), Instant(0.5), generator())
+        assert value is not None
+        values.append(value)
+    mean = motion.tensors()["time_offsets"].square().mean()
+    torch.testing.assert_close(values[1] - values[0], 0.5 * mean, atol=1e-6, rtol=1e-4)
+
+
+@pytest.mark.usefixtures("kernels_on_the_cpu")
+def test_a_gpu_has_several_frames_at_once_as_it_has_each() -> None:
+    motion = disturbed(started("control_points", COUNT, time_offsets=True))
+    splats, offsets = splats_of(COUNT), motion.tensors()["time_offsets"]
+    instants = [Instant(time) for time in (0.1, 0.5, 0.99)]
+    weights = torch.randn(COUNT, 3, generator=generator(3))
+    together = motion.at_instants(Moment(splats), instants)
+    alone = [motion.at(Moment(splats), instant) for instant in instants]
+    slopes = []
+    for moments in (together, alone):
+        total = torch.stack([(moment.splats.means * weights).sum() for moment in moments]).sum()
+        slopes.append(torch.autograd.grad(total, offsets)[0])
+    for one, other in zip(together, alone, strict=True):
+        torch.testing.assert_close(one.splats.means, other.splats.means)
+    assert slopes[0].count_nonzero() > 2
+    torch.testing.assert_close(slopes[0], slopes[1])

@@ -25,8 +25,13 @@ from gsdmsr_cli.training.gradients.phase import Order, Phase, ViewGradients
 from gsdmsr_cli.training.gradients.replays import Replays, ViewInputs, recorder_for
 from gsdmsr_cli.training.trainer import Trainer
 
-MOTIONS = [("control_points", ("motion.count=20",)), ("hexplane", ()), ("multiscale", ()),
-           ("static", ())]  # fmt: skip
+MOTIONS = [
+    ("control_points", ("motion.count=20",)),
+    ("control_points", ("motion.count=20", "motion.time_offsets=true")),
+    ("hexplane", ()),
+    ("multiscale", ()),
+    ("static", ()),
+]
 VIEWS = 3
 
 
