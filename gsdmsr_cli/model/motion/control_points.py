@@ -46,8 +46,9 @@ class Options:
             an even grid: above 0, at most 1.
         time_degree: of the B-splines between them, 1 (straight lines) or 3 (cubic curves, whose
             velocity and acceleration do not jump).
-        time_offsets: whether it is learnt at which time each frame was taken, beside what it says.
-        time_offset_weight: weight of the mean square of these offsets [1 / frame^2].
+        time_offsets_from: progress from which on it is learnt when each frame was taken, beside
+            what it says; 1 for never.
+        time_offsets_weight: weight of the mean square of these offsets [1 / frame^2].
         width: width of the network's two hidden layers, a multiple of 16.
         space_smoothness, time_smoothness, time_stillness: weights of the plane regularisers.
         rigidity: weight of the control points' deviation from rigid motion.
@@ -63,8 +64,8 @@ class Options:
     time_ratio: float = 0.2
     time_ends: float = 1.0
     time_degree: int = 1
-    time_offsets: bool = False
-    time_offset_weight: float = 1e-3
+    time_offsets_from: float = 1.0
+    time_offsets_weight: float = 1e-3
     width: int = 32
     space_smoothness: float = 1e-4
     time_smoothness: float = 1e-2
@@ -78,14 +79,20 @@ class Options:
         require_multiples(self, "channels", "width")
         require(self, "time_ends", 0 < self.time_ends <= 1, "above 0, at most 1")
         require_degree(self, "time_degree")
-        require_at_least(self, 0, "time_offset_weight")
+        require_progress(self, "time_offsets_from")
+        require_at_least(self, 0, "time_offsets_weight")
         require_progress(self, "rigidity_until")
 
 
 class ControlPointMotion(ControlPoints):
-    """Control points with radii, whose displacement, rotation and scaling a plane grid gives."""
+    """Control points with radii, whose displacement, rotation and scaling a plane grid gives.
 
-    constants = ()
+    Attributes:
+        follows_offsets: whether frames are shown at the times that they were taken at, as far as
+            these have been learnt.
+    """
+
+    constants = ("follows_offsets",)
 
     def __init__(self, options: Options, facts: Facts, generator: torch.Generator) -> None:
         super().__init__(options.count, options.neighbours, options.gather, facts, generator)
@@ -93,8 +100,9 @@ class ControlPointMotion(ControlPoints):
         self._rigidity = options.rigidity
         times = time_nodes(facts.frames, options.time_ratio)
         self._offsets: TimeOffsets | None = None
-        if options.time_offsets and facts.frames > 1:
+        if options.time_offsets_from < 1 and facts.frames > 1:
             self._offsets = TimeOffsets(facts.frames)
+        self.follows_offsets = True
         self._denser = sparser_at_ends(options.time_ends)
         self.levels = planes.new_levels(options.levels, times, options.channels, generator)
         widths = [options.channels * len(options.levels), options.width, options.width, OUTPUTS]
@@ -111,16 +119,17 @@ class ControlPointMotion(ControlPoints):
     def advance(self, progress: float) -> None:
         """Enter the phase of training that belongs to ``progress`` in [0, 1]."""
         super().advance(progress)
+        o = self.options
+        self.follows_offsets = progress >= o.time_offsets_from
         if self._offsets is not None:
             self._offsets.refresh()
-        o = self.options
         if o.rigidity_until:
             left = 2 * (1 - progress / o.rigidity_until)
             self._rigidity = o.rigidity * min(max(left, 0.0), 1.0)
 
     def _deformations(self, points: Tensor, times: Sequence[float]) -> Tensor:
         """Return the outputs for points when the frames of these times were taken."""
-        if self._offsets is None:
+        if self._offsets is None or not self.follows_offsets:
             return self._outputs(points, times, planes.as_given)
         return self._offsets.follow(lambda clock: self._outputs(points, times, clock), times)
 
@@ -149,8 +158,8 @@ class ControlPointMotion(ControlPoints):
         """
         o = self.options
         value = planes.penalty(self.levels, o.space_smoothness, o.time_smoothness, o.time_stillness)
-        if self._offsets is not None:
-            value = value + o.time_offset_weight * self._offsets.values.square().mean()
+        if self._offsets is not None and self.follows_offsets:
+            value = value + o.time_offsets_weight * self._offsets.values.square().mean()
         if not self._rigidity:
             return value
         points = self.control_points.detach()

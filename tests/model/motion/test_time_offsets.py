@@ -73,7 +73,7 @@ def test_frames_that_were_taken_at_other_times_are_found() -> None:
 
 
 def test_control_points_with_no_offset_yet_are_as_an_even_clock_has_them() -> None:
-    motion = disturbed(started("control_points", COUNT, time_offsets=True))
+    motion = disturbed(started("control_points", COUNT, time_offsets_from=0.5))
     tensors = motion.tensors()
     assert tensors["time_offsets"].shape == (FACTS.frames,)
     with torch.no_grad():
@@ -84,9 +84,27 @@ def test_control_points_with_no_offset_yet_are_as_an_even_clock_has_them() -> No
     torch.testing.assert_close(found.means, earlier.means, atol=1e-6, rtol=0)
 
 
+def test_before_their_progress_offsets_are_neither_followed_nor_learnt() -> None:
+    motion = disturbed(started("control_points", COUNT, time_offsets_from=0.5))
+    splats = splats_of(COUNT)
+    later = moved_by(motion, splats, 0.3).means
+    motion.advance(0.4)
+    found = moved_by(motion, splats, 0.3).means
+    assert not torch.equal(found, later)
+    found.sum().backward()
+    value = motion.penalty(Moment(splats), Instant(0.3), generator())
+    assert value is not None
+    value.backward()
+    assert motion.tensors()["time_offsets"].grad is None
+    with torch.no_grad():
+        motion.tensors()["time_offsets"].zero_()
+    motion.advance(0.5)
+    torch.testing.assert_close(moved_by(motion, splats, 0.3).means, found, atol=1e-6, rtol=0)
+
+
 @pytest.mark.parametrize("degree", [1, 3])
 def test_the_offsets_of_control_points_have_the_gradient_of_the_splats_places(degree: int) -> None:
-    given = {"time_offsets": True, "time_degree": degree, "time_ratio": 1.0}
+    given = {"time_offsets_from": 0.5, "time_degree": degree, "time_ratio": 1.0}
     motion = disturbed(started("control_points", COUNT, **given))
     offsets, splats = motion.tensors()["time_offsets"], splats_of(COUNT)
     weights, time, step = torch.randn(COUNT, 3, generator=generator(3)), 10 / 19, 0.25
@@ -104,7 +122,7 @@ def test_the_offsets_of_control_points_have_the_gradient_of_the_splats_places(de
 
 
 def test_the_rigidity_tells_offsets_nothing() -> None:
-    given = {"time_offsets": True, "time_offset_weight": 0.0}
+    given = {"time_offsets_from": 0.5, "time_offsets_weight": 0.0}
     motion = disturbed(started("control_points", COUNT, **given))
     value = motion.penalty(Moment(splats_of(COUNT)), Instant(0.5), generator())
     assert value is not None
@@ -115,12 +133,12 @@ def test_the_rigidity_tells_offsets_nothing() -> None:
 
 def test_a_scene_of_one_moment_has_no_offsets() -> None:
     facts = replace(FACTS, frames=1)
-    motion = start_motion({"name": "control_points", "time_offsets": True}, facts, COUNT)
+    motion = start_motion({"name": "control_points", "time_offsets_from": 0.5}, facts, COUNT)
     assert "time_offsets" not in motion.tensors()
 
 
 def test_a_checkpoint_needs_an_offset_for_each_frame() -> None:
-    motion = started("control_points", COUNT, time_offsets=True)
+    motion = started("control_points", COUNT, time_offsets_from=0.5)
     (parameter,) = (p for p in motion.parameters() if p.name == "time_offsets")
     parameter.set_values(torch.zeros(FACTS.frames - 1))
     with pytest.raises(ValueError, match=r"time offsets \(19,\) for 20 frames"):
@@ -131,7 +149,7 @@ def test_offsets_cost_their_mean_square() -> None:
     """Beside what the rest of the motion costs, with a weight."""
     values = []
     for weight in (0.0, 0.5):
-        given = {"time_offsets": True, "time_offset_weight": weight}
+        given = {"time_offsets_from": 0.5, "time_offsets_weight": weight}
         motion = disturbed(started("control_points", COUNT, **given))
         value = motion.penalty(Moment(splats_of(COUNT)), Instant(0.5), generator())
         assert value is not None
@@ -142,7 +160,7 @@ def test_offsets_cost_their_mean_square() -> None:
 
 @pytest.mark.usefixtures("kernels_on_the_cpu")
 def test_a_gpu_has_several_frames_at_once_as_it_has_each() -> None:
-    motion = disturbed(started("control_points", COUNT, time_offsets=True))
+    motion = disturbed(started("control_points", COUNT, time_offsets_from=0.5))
     splats, offsets = splats_of(COUNT), motion.tensors()["time_offsets"]
     instants = [Instant(time) for time in (0.1, 0.5, 0.99)]
     weights = torch.randn(COUNT, 3, generator=generator(3))

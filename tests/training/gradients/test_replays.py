@@ -27,7 +27,7 @@ from gsdmsr_cli.training.trainer import Trainer
 
 MOTIONS = [
     ("control_points", ("motion.count=20",)),
-    ("control_points", ("motion.count=20", "motion.time_offsets=true")),
+    ("control_points", ("motion.count=20", "motion.time_offsets_from=0")),
     ("hexplane", ()),
     ("multiscale", ()),
     ("static", ()),
