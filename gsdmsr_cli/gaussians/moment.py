@@ -20,11 +20,14 @@ class Moment:
             log_scales of the splats are not read. None if those hold.
         features: (N, F) with F >= 1, blended as colours are, sum of weight times feature, without
             a background or bounds. None if there are none.
+        canonical_quats: (N, 4) the rotations that the motion was given, for layers that ask how
+            splats have turned; not drawn. None unless a layer ``needs_turns``.
     """
 
     splats: Splats
     axes: Tensor | None = None
     features: Tensor | None = None
+    canonical_quats: Tensor | None = None
 
     def __post_init__(self) -> None:
         if self.axes is not None and tuple(self.axes.shape) != (len(self), 3, 3):
@@ -47,7 +50,8 @@ class Moment:
 
     def map(self, function: Callable[[Tensor], Tensor]) -> Moment:
         """Return the moment with ``function`` applied to every tensor, also to those not read."""
-        further = (None if t is None else function(t) for t in (self.axes, self.features))
+        given = self.axes, self.features, self.canonical_quats
+        further = (None if t is None else function(t) for t in given)
         return Moment(self.splats.map(function), *further)
 
     def take(self, rows: Tensor) -> Moment:

@@ -28,7 +28,8 @@ def split(moment: Moment, count: int) -> tuple[Moment, Moment]:
     """Return the first ``count`` rows of a moment and the others, both without a copy."""
     sizes = [count, len(moment) - count]
     splats = {name: t.split(sizes) for name, t in moment.splats.tensors().items()}
-    further = [None if t is None else t.split(sizes) for t in (moment.axes, moment.features)]
+    given = moment.axes, moment.features, moment.canonical_quats
+    further = [None if t is None else t.split(sizes) for t in given]
     first, rest = (
         Moment(
             Splats(**{name: both[i] for name, both in splats.items()}),
@@ -49,7 +50,7 @@ def join(whole: Moment, first: Moment, rest: Moment, after: Moment) -> Moment:
     """
     if after.axes is not None and rest.axes is None:
         own = scaled_axes(rest.splats.quats, rest.splats.log_scales)
-        rest = Moment(rest.splats, own, rest.features)
+        rest = replace(rest, axes=own)
     changed = {
         name: torch.cat([tensor, getattr(rest.splats, name)])
         for name, tensor in after.splats.tensors().items()
@@ -61,7 +62,7 @@ def join(whole: Moment, first: Moment, rest: Moment, after: Moment) -> Moment:
         if (now is None) != (still is None):
             raise ValueError(f"a layer that adds {name} has to concern still splats as well")
         further[name] = None if now is None else torch.cat([now, still])
-    return Moment(replace(whole.splats, **changed), **further)
+    return replace(whole, splats=replace(whole.splats, **changed), **further)
 
 
 def mask_gradients(before: Moment, after: Moment, mask: Tensor) -> Moment:

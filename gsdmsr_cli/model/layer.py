@@ -85,6 +85,8 @@ class Layer(ABC):
         before_motion: whether it is applied before the motion, to the canonical splats, whatever
             the instant; of two such layers in the order of the preset's list.
         needs_camera, needs_jitter: what it wants to know of an instant beside the time.
+        needs_turns: whether it wants to know of a moment what rotations splats had before the
+            motion.
         shades: whether ``shade`` does anything.
         holds_views: whether it holds something of each picture of the capture, and does nothing
             where none of these is drawn.
@@ -99,6 +101,7 @@ class Layer(ABC):
     before_motion: ClassVar[bool] = False
     needs_camera: ClassVar[bool] = False
     needs_jitter: bool = False
+    needs_turns: ClassVar[bool] = False
     shades: ClassVar[bool] = False
     holds_views: ClassVar[bool] = False
     constants: ClassVar[Sequence[str] | None] = None
@@ -121,7 +124,7 @@ class Layer(ABC):
     def place(self, camera: Camera, time: float) -> Camera:
         """Return the camera that a picture of the capture is drawn by; ``camera`` is the scene's.
 
-        Called of layers that hold views alone, as are ``trace`` and ``tell_views``.
+        Called of layers that hold views alone.
         """
         return camera
 

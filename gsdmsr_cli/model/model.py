@@ -182,7 +182,10 @@ class Model:
         """
         canonical = Moment(self.splats)
         with computing_in(self.precision):
-            moments = [self._begun(canonical, instants[0])] * len(instants)
+            begun = self._begun(canonical, instants[0])
+            if any(layer.needs_turns for layer in self.layers.values()):
+                begun = replace(begun, canonical_quats=begun.splats.quats)
+            moments = [begun] * len(instants)
             for layer in self._before_motion(False):
                 moments = self._through(layer, moments, instants)
         if gradient_mask is None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from html import escape
 
 from gsdmsr_cli.evaluation import summary
@@ -237,12 +237,21 @@ def _frames(document: Document) -> str:
     return f'<details class="card wide"><summary>All {count} frames</summary>{shown}</details>'
 
 
-def _of_views(told: Document) -> str:
-    """Return what a layer that holds something of views has done to those of the split."""
-    return (
-        f"{told['about']}; of the split {told['own']} have their own, {told['of_neighbours']} that "
-        f"of neighbours, {told['none']} none"
-    )
+def _of_views(told: Document, of: str = "") -> Iterator[tuple[str, str]]:
+    """Yield what layers have done to views of the split, by layer, or by segment and layer."""
+    for key, found in told.items():
+        name = of + key
+        if "about" not in found:
+            yield from _of_views(found, f"segment {name}, ")
+        elif (offsets := found.get("time_offsets")) is not None:
+            most = max(map(abs, offsets))
+            yield name, f"{found['about']}; by at most {most:.2f} frames earlier or later"
+        else:
+            yield (
+                name,
+                f"{found['about']}; of the split {found['own']} have their own, "
+                f"{found['of_neighbours']} that of neighbours, {found['none']} none",
+            )
 
 
 def _protocol(document: Document) -> str:
@@ -253,7 +262,7 @@ def _protocol(document: Document) -> str:
         ("checkpoint", f"{about['checkpoint']}, step {about['checkpoint_step']}"),
         ("device", summary.machine(document)),
         ("data", about["data_fingerprint"]),
-        *((name, _of_views(told)) for name, told in about.get("views", {}).items()),
+        *_of_views(about.get("views", {})),
         *(about["conventions"].items()),
         ("versions", ", ".join(f"{name} {text}" for name, text in about["versions"].items())),
     )

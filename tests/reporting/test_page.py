@@ -123,6 +123,18 @@ def test_one_lpips_is_shown_large(there: str, shown: str) -> None:
     assert tiles == [shown]
 
 
+def test_what_layers_did_to_views_is_told_also_by_segment() -> None:
+    exposure = {"about": "colours", "per": "picture", "own": 3, "of_neighbours": 2, "none": 1}
+    motion = {"about": "shown later", "time_offsets": [0.25, -0.75, 0.0]}
+    one = {"exposure": exposure, "motion": motion}
+    for views, before in ((one, ""), ({"0": one, "1": {"motion": motion}}, "segment 1, ")):
+        texts = read(made(protocol=small_report()["protocol"] | {"views": views})).texts
+        assert f"{before}motion" in texts
+        assert "shown later; by at most 0.75 frames earlier or later" in texts
+        told = "colours; of the split 3 have their own, 2 that of neighbours, 1 none"
+        assert told in texts
+
+
 def test_charts_have_titles_and_axes() -> None:
     charts = re.findall(r"<svg.*?</svg>", made(), re.DOTALL)
     assert len(charts) == 3

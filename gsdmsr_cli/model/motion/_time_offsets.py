@@ -48,6 +48,11 @@ class TimeOffsets:
         """Read the values as they are now, for steps that are replayed."""
         self._known = self.values.tolist()
 
+    def of(self, times: Sequence[float]) -> list[float]:
+        """Return the offsets of frames of these times [frames]."""
+        found: list[float] = (hats(times, self.values) @ self.values).tolist()
+        return found
+
     def inside(self, time: float) -> float:
         """Return where in [0, 1] a time lies that may be a frame before 0 or after 1.
 

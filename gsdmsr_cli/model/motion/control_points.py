@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -29,6 +30,7 @@ from gsdmsr_cli.model.parameter import name_parameters
 from gsdmsr_cli.ops import network, planes, skin
 from gsdmsr_cli.ops.displace import OUTPUTS
 from gsdmsr_cli.options.strict import require, require_at_least, require_progress
+from gsdmsr_cli.scene.camera import Camera
 
 
 @dataclass(frozen=True)
@@ -121,7 +123,7 @@ class ControlPointMotion(ControlPoints):
         super().advance(progress)
         o = self.options
         self.follows_offsets = progress >= o.time_offsets_from
-        if self._offsets is not None:
+        if self._offsets is not None and self.follows_offsets:
             self._offsets.refresh()
         if o.rigidity_until:
             left = 2 * (1 - progress / o.rigidity_until)
@@ -167,6 +169,13 @@ class ControlPointMotion(ControlPoints):
         time = float(torch.rand((), generator=generator))
         transforms = skin.transforms(points, self._outputs(points, [time], planes.as_given)[0])
         return value + self._rigidity * rigidity(points, transforms, near)
+
+    def tell_views(self, views: Sequence[tuple[Camera, float]]) -> dict[str, Any]:
+        """Return by how many frames later than they say views are shown."""
+        if self._offsets is None:
+            return {}
+        about = "shown at the times at which train pictures, it was learnt, had been taken"
+        return {"about": about, "time_offsets": self._offsets.of([time for _, time in views])}
 
     def check(self) -> None:
         """Raise ValueError unless control points, grid, network and offsets fit together."""

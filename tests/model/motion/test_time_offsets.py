@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 from kernel_checks import generator
@@ -14,6 +15,7 @@ from torch import Tensor
 from gsdmsr_cli.gaussians.moment import Moment
 from gsdmsr_cli.model.layer import Instant
 from gsdmsr_cli.model.motion._time_offsets import Clock, TimeOffsets
+from gsdmsr_cli.scene.camera import Camera
 
 COUNT = 7
 
@@ -135,6 +137,16 @@ def test_a_scene_of_one_moment_has_no_offsets() -> None:
     facts = replace(FACTS, frames=1)
     motion = start_motion({"name": "control_points", "time_offsets_from": 0.5}, facts, COUNT)
     assert "time_offsets" not in motion.tensors()
+
+
+def test_a_report_says_how_much_later_views_are_shown() -> None:
+    motion = started("control_points", COUNT, time_offsets_from=0.5)
+    with torch.no_grad():
+        motion.tensors()["time_offsets"][:3] = torch.tensor([0.5, -0.5, 0.25])
+    camera = Camera(np.eye(4), 5.0, 6.0, 9.0, 8.0, 18, 16)
+    told = motion.tell_views([(camera, 0.0), (camera, 1.5 / (FACTS.frames - 1)), (camera, 1.0)])
+    assert told["time_offsets"] == pytest.approx([0.5, -0.125, 0.0], abs=1e-6)
+    assert started("control_points", COUNT).tell_views([(camera, 0.0)]) == {}
 
 
 def test_a_checkpoint_needs_an_offset_for_each_frame() -> None:
