@@ -22,6 +22,7 @@ from gsdmsr_cli.ops import skin as skinning
 from gsdmsr_cli.ops.adam.cuda import Row, adam
 from gsdmsr_cli.ops.cube_map import show_behind
 from gsdmsr_cli.ops.hats import hats
+from gsdmsr_cli.ops.lighting import light
 from gsdmsr_cli.ops.nearest import nearest_points
 from gsdmsr_cli.ops.series import add_series
 from gsdmsr_cli.ops.slices import slices
@@ -184,6 +185,13 @@ def _add_series(device: str, dtype: torch.dtype) -> Values:
     return _with_gradients(added, ("starts", "coefficients", "bases"), leaves)
 
 
+def _light(device: str, dtype: torch.dtype) -> Values:
+    shapes = (_COUNT, 4, 3), (_COUNT, 3, 3), (_COUNT, 4), (_COUNT, 4)
+    given = (_random(*shape, seed=seed) for seed, shape in enumerate(shapes))
+    sh, slopes, *quats = _leaves(device, dtype, *given)
+    return _with_gradients(light(sh, slopes, *quats), ("harmonics", "slopes"), [sh, slopes])
+
+
 def _share(device: str, dtype: torch.dtype) -> Values:
     return {"shares": hats([0.0, 0.3, 1.0], torch.zeros(_COUNT, device=device, dtype=dtype))}
 
@@ -260,6 +268,7 @@ OPERATIONS = {
     "skinning splats": _Operation(_skin, FLOAT32),
     "displacing splats": _Operation(_displace, FLOAT32),
     "adding series": _Operation(_add_series, FLOAT32),
+    "colours of splats that have turned": _Operation(_light, FLOAT32),
     "shares of nodes in time": _Operation(_share, FLOAT32),
     "slices of Gaussians in time": _Operation(_slice, FLOAT32),
     "colours behind splats": _Operation(_show_behind, FLOAT32),

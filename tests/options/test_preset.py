@@ -75,9 +75,10 @@ def test_the_default_preset_spells_out_every_default() -> None:
 
 @pytest.mark.parametrize(("name", "base"), [("static", "dnerf"), ("hexplane", "gsdmsr")])
 def test_these_differ_from_their_base_in_the_motion_alone(name: str, base: str) -> None:
+    """And in the layers that ask how it turns splats."""
     own, other = load_preset(name, None, []), load_preset(base, None, [])
-    assert own.motion["name"] == name
-    assert dataclasses.replace(own, motion=other.motion) == other
+    assert own.motion["name"] == name and not own.layers
+    assert dataclasses.replace(own, motion=other.motion, layers=other.layers) == other
 
 
 def test_layers_override_in_order(presets: Path, tmp_path: Path) -> None:

@@ -13,14 +13,12 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import torch
-from torch import Tensor
 
 from gsdmsr_cli.gaussians.moment import Moment
 from gsdmsr_cli.gaussians.splats import Splats
-from gsdmsr_cli.ground.geometry import quat_product
 from gsdmsr_cli.model.layer import Facts, Instant, Layer
 from gsdmsr_cli.model.parameter import Parameter
-from gsdmsr_cli.ops.series import add_series
+from gsdmsr_cli.ops.lighting import light
 from gsdmsr_cli.options.strict import require_rates
 
 
@@ -50,23 +48,15 @@ class Lighting(Layer):
 
     def at(self, moment: Moment, instant: Instant) -> Moment:
         """Return the splats in the colours that their turns give; turns have no gradient of it."""
-        sh = moment.splats.sh
-        added = add_series(sh.flatten(1), self.slopes, _turns(moment))
-        return replace(moment, splats=replace(moment.splats, sh=added.view_as(sh)))
+        assert moment.canonical_quats is not None
+        splats = moment.splats
+        sh = light(splats.sh, self.slopes, splats.quats, moment.canonical_quats)
+        return replace(moment, splats=replace(splats, sh=sh))
 
     def check(self) -> None:
         """Raise ValueError unless slopes are those of three axes and channels."""
         if self.slopes.shape[1:] != (3, 3):
             raise ValueError(f"slopes of shape {tuple(self.slopes.shape)}")
-
-
-@torch.no_grad()
-def _turns(moment: Moment) -> Tensor:
-    """Return twice the vector parts (N, 3) of how splats have turned."""
-    assert moment.canonical_quats is not None
-    back = moment.canonical_quats * moment.splats.quats.new_tensor([1.0, -1.0, -1.0, -1.0])
-    turns = torch.nn.functional.normalize(quat_product(moment.splats.quats, back), dim=1)
-    return torch.where(turns[:, :1] < 0, -2.0, 2.0) * turns[:, 1:]
 
 
 def start(options: Options, facts: Facts, splats: Splats, generator: torch.Generator) -> Lighting:

@@ -19,6 +19,7 @@ from motion_checks import FACTS, disturbed, splats_of
 from torch import Tensor
 
 from gsdmsr_cli.gaussians.moment import Moment
+from gsdmsr_cli.gaussians.splats import Splats
 from gsdmsr_cli.ground import plugins
 from gsdmsr_cli.ground.errors import UsageError
 from gsdmsr_cli.model import layers
@@ -49,6 +50,11 @@ def learnt(name: str) -> Layer:
     return disturbed(started_layer(name, COUNT))
 
 
+def moment_of(splats: Splats) -> Moment:
+    """Return what a motion made of other splats, for layers that ask how they have turned."""
+    return Moment(splats, canonical_quats=splats_of(len(splats), 1).quats)
+
+
 def tensors_at(layer: Layer, moment: Moment, time: float) -> dict[str, Tensor]:
     """Return all tensors of what a layer makes of a moment."""
     after = layer.at(moment, Instant(time))
@@ -68,7 +74,7 @@ def test_the_known_layers_are_found() -> None:
 
 @every_layer
 def test_only_one_that_says_so_changes_splats_from_the_start(name: str) -> None:
-    moment = Moment(splats_of(COUNT))
+    moment = moment_of(splats_of(COUNT))
     for progress in (0.0, 1.0):
         layer = started_layer(name, COUNT)
         layer.advance(progress)
@@ -89,7 +95,7 @@ def test_only_one_that_says_so_changes_splats_from_the_start(name: str) -> None:
 @settings(max_examples=15, deadline=None)
 def test_resize_then_apply_is_apply_then_resize(name: str, rows: list[int], time: float) -> None:
     wanted = torch.tensor(rows, dtype=torch.long)
-    moment, layer = Moment(splats_of(COUNT)), copy.deepcopy(learnt(name))
+    moment, layer = moment_of(splats_of(COUNT)), copy.deepcopy(learnt(name))
     expected = {what: t[wanted] for what, t in tensors_at(layer, moment, time).items()}
     layer.take(wanted, torch.zeros_like(wanted, dtype=torch.bool))
     assert_close(tensors_at(layer, moment.take(wanted), time), expected)
@@ -101,7 +107,7 @@ def test_gradients_reach_all_that_is_trained_for_each_splat(name: str) -> None:
     layer, rng = disturbed(started_layer(name, COUNT)), generator(5)
     parts = []
     for time in TIMES:
-        for tensor in tensors_at(layer, Moment(splats), time).values():
+        for tensor in tensors_at(layer, moment_of(splats), time).values():
             parts.append((tensor * torch.randn(tensor.shape, generator=rng)).sum())
     torch.stack(parts).sum().backward()
     for parameter in layer.parameters():
@@ -125,7 +131,7 @@ def test_parameters_have_names_of_their_own_and_learning_rates(name: str) -> Non
 
 @every_layer
 def test_what_is_saved_comes_back_the_same(name: str) -> None:
-    layer, moment = learnt(name), Moment(splats_of(COUNT))
+    layer, moment = learnt(name), moment_of(splats_of(COUNT))
     loaded = started_layer(name, COUNT + 3)
     loaded.restore(layer.tensors(), COUNT)
     loaded.advance(1.0)

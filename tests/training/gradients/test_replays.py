@@ -28,6 +28,7 @@ from gsdmsr_cli.training.trainer import Trainer
 MOTIONS = [
     ("control_points", ("motion.count=20",)),
     ("control_points", ("motion.count=20", "motion.time_offsets_from=0")),
+    ("control_points", ("motion.count=20", "layers=[{name: lighting}]")),
     ("hexplane", ()),
     ("multiscale", ()),
     ("static", ()),
