@@ -20,6 +20,7 @@ from training_checks import STEPS, preset_of, trainer_of
 from gsdmsr_cli.backends.cuda import launch
 from gsdmsr_cli.formats import read_scene
 from gsdmsr_cli.model.motion import control_points
+from gsdmsr_cli.model.motion._time_offsets import TimeOffsets
 from gsdmsr_cli.model.parameter import Parameter
 from gsdmsr_cli.ops.rasterize.cuda import room
 from gsdmsr_cli.options.preset import Preset
@@ -132,6 +133,9 @@ def nobody(monkeypatch: pytest.MonkeyPatch) -> Nobody:
     return nobody
 
 
+LIGHTING = "layers=[{name: lighting}]"
+
+
 def elsewhere(data: Path, preset: Preset) -> Trainer:
     pictures = Pictures((1.0, 1.0, 1.0), preset.data.downscale, 1 << 24)
     return Trainer(read_scene(data), preset, load_engine("cuda"), pictures, "meta")
@@ -156,7 +160,8 @@ def test_a_step_waits_for_nothing_and_stays_on_its_device(
 ) -> None:
     preset = preset_of(
         "training.static_until=0", f"training.views_per_step={views}", "motion.coarse_until=0",
-        "density.start=1000", "density.reset_at=[]", "training.average_from=0", *options,
+        "density.start=1000", "density.reset_at=[]", "training.average_from=0", "layers=[]",
+        *options,
     )  # fmt: skip
     trainer = elsewhere(tiny_scene, preset)
     for _ in range(11):
@@ -178,17 +183,30 @@ def test_hexplane_stays_on_its_device(tiny_scene: Path, nobody: Nobody, option: 
     assert {"lookup", "lookup_backward", "time_penalty"} <= set(nobody.asked)
 
 
+@pytest.mark.parametrize("further", [(), ("motion.time_offsets_from=0", LIGHTING)])
 def test_control_points_stay_on_their_device(
-    tiny_scene: Path, nobody: Nobody, monkeypatch: pytest.MonkeyPatch
+    tiny_scene: Path, nobody: Nobody, monkeypatch: pytest.MonkeyPatch, further: tuple[str, ...]
 ) -> None:
-    """But for spreading them, which waits, as growing does."""
+    """But for spreading them and reading offsets, which wait, as growing does."""
     monkeypatch.setattr(control_points.ControlPointMotion, "reanchor", lambda *_: ())
-    options = "training.static_until=0", "motion.count=20", "density.start=1000"
+    monkeypatch.setattr(TimeOffsets, "advance", lambda *_: None)
+    options = "training.static_until=0", "motion.count=20", "density.start=1000", *further
     trainer = elsewhere(tiny_scene, preset_of(*options, motion="control_points"))
     for _ in range(5):
         trainer.step()
     backward = {"transform_backward", "skin_backward", "lookup_backward"}
     assert {"nearest", "transform", "skin"} | backward <= set(nobody.asked)
+    assert not further or {"hats", "add_series", "add_series_backward"} <= set(nobody.asked)
+
+
+def test_offsets_of_frames_are_read_a_thousand_times(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A training on a GPU waits for it so often, and for a step's offsets never."""
+    reads: list[float] = []
+    monkeypatch.setattr(TimeOffsets, "_read", lambda _: reads.append(0.0))
+    offsets = TimeOffsets(20)
+    for step in range(20_001):
+        offsets.advance(step / 20_000)
+    assert 900 <= len(reads) <= 1001
 
 
 def losses(trainer: Trainer, steps: int) -> list[float]:

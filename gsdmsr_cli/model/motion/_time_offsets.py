@@ -12,12 +12,14 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
-from gsdmsr_cli.backends.cuda import recording
 from gsdmsr_cli.model.parameter import Parameter
 from gsdmsr_cli.ops.hats import hats
 
 _AROUND = -0.25, 0.25
 """The two times of which a motion's slope is taken, after that of the slope [frames]."""
+
+_READ_EVERY = 1e-3
+"""Progress after which a training reads its offsets anew, for which a GPU is waited for."""
 
 Clock = Callable[[float], float]
 """Says at which time a frame of a time was taken."""
@@ -39,13 +41,19 @@ class TimeOffsets:
         self.values = torch.zeros(frames)
         self._frame = 1 / (frames - 1)
         self._known: list[float] = self.values.tolist()
+        self._known_at = -1.0
 
     def parameters(self, name: str) -> Sequence[Parameter]:
         """Return the offsets as what is trained, under a name."""
         return (Parameter(name, self.values, rate="embeddings", time_axis=0),)
 
-    def refresh(self) -> None:
-        """Read the values as they are now, for steps that are replayed."""
+    def advance(self, progress: float) -> None:
+        """Read the offsets if those that are known are of too long ago."""
+        if abs(progress - self._known_at) >= _READ_EVERY:
+            self._read()
+            self._known_at = progress
+
+    def _read(self) -> None:
         self._known = self.values.tolist()
 
     def of(self, times: Sequence[float]) -> list[float]:
@@ -69,8 +77,8 @@ class TimeOffsets:
             motion: returns (T, ...) at the times to which a clock takes ``times``.
             times: what the frames say, in [0, 1].
         """
-        if not recording.is_recording():  # a stream that is recorded cannot be waited for
-            self.refresh()
+        if self.values.device.type == "cpu" or not torch.is_grad_enabled():
+            self._read()  # a step on a GPU waits for nothing
         values = motion(self._clock(0.0))
         if not torch.is_grad_enabled():
             return values

@@ -124,7 +124,7 @@ class ControlPointMotion(ControlPoints):
         o = self.options
         self.follows_offsets = progress >= o.time_offsets_from
         if self._offsets is not None and self.follows_offsets:
-            self._offsets.refresh()
+            self._offsets.advance(progress)
         if o.rigidity_until:
             left = 2 * (1 - progress / o.rigidity_until)
             self._rigidity = o.rigidity * min(max(left, 0.0), 1.0)

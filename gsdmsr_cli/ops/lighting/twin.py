@@ -11,7 +11,7 @@ from gsdmsr_cli.ops.series.twin import add_series_twin
 
 def turns_twin(quats: Tensor, canonical_quats: Tensor) -> Tensor:
     """Return twice the vector parts (N, 3) of the unit quaternions between rotations (N, 4)."""
-    back = canonical_quats * canonical_quats.new_tensor([1.0, -1.0, -1.0, -1.0])
+    back = torch.cat([canonical_quats[:, :1], -canonical_quats[:, 1:]], dim=1)
     turns = torch.nn.functional.normalize(quat_product(quats, back), dim=1)
     return torch.where(turns[:, :1] < 0, -2.0, 2.0) * turns[:, 1:]
 
