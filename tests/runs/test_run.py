@@ -497,7 +497,7 @@ def as_before_version_0_2(run: Run) -> None:
 def test_a_run_of_schema_1_is_converted_when_it_is_read(
     tmp_path: Path, scene: Scene, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    options = ["motion.count=16", "density.reset_opacity=0.01"]
+    options = ["motion.count=16", "density.reset_opacity=0.01", "layers=[]"]
     preset, splats = load_preset("dnerf", None, options), splats_of(9)
     run = create_run(tmp_path / "run", "dnerf", preset, FACTS, scene)
     model = start_model(splats, preset.motion, (), FACTS, torch.Generator().manual_seed(0))

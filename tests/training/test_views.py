@@ -180,7 +180,7 @@ def test_views_of_the_capture_are_drawn_by_what_was_learnt_and_others_are_not(
         filmed = BufferRenderer(renderer, 1, ["rgb"]).draw(shot, None)
         assert np.array_equal(filmed.rgb, renderer.draw(view).numpy()), "a film shows the same"
     told = model.tell_views([(view.camera, view.time) for view in refined.scene.split("val")])
-    assert set(told) == {"cameras", "exposure"}
+    assert set(told) == {"cameras", "exposure", "motion"}
     assert told["cameras"]["of_neighbours"] == len(refined.scene.split("val"))
 
 

@@ -4,9 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
+import torch
 from torch import Tensor
 
+from gsdmsr_cli.backends.tensors import array
 from gsdmsr_cli.ops.choose import choose
+from gsdmsr_cli.ops.hats import cpu as kernels
 from gsdmsr_cli.ops.hats import cuda
 from gsdmsr_cli.ops.hats.twin import hats_twin
 
@@ -20,6 +24,11 @@ def hats(times: Sequence[float], values: Tensor) -> Tensor:
     taken as the nearest within. In a step that is recorded the times are those of its views, and so
     they are when it is replayed.
     """
-    if choose(values) == "cuda":
+    form = choose(values)
+    if form == "cuda":
         return cuda.hats(times, values)
+    if form == "cpu":
+        found = torch.empty(len(times), len(values))
+        kernels.hats(np.array(times, np.float32), array(found))
+        return found
     return hats_twin(times, values)

@@ -36,6 +36,13 @@ def test_a_kernel_has_the_same(place: str, times: list[float], nodes: int) -> No
     assert_near(cuda.hats(times, values.to(place)).cpu(), truth, 1e-7 * nodes, "shares")
 
 
+@pytest.mark.parametrize("nodes", [2, 300])
+def test_a_cpu_has_the_same(nodes: int) -> None:
+    times, values = [0.0, 0.3, 0.77, 1.0, -0.1, 1.1], torch.zeros(nodes)
+    truth = hats_twin(times, values.double())
+    assert_near(hats(times, values), truth, 1e-7 * nodes, "shares")
+
+
 def test_more_times_than_a_kernel_is_told_of_are_refused() -> None:
     with pytest.raises(ValueError, match="17 times; at most 16 are asked for at once"):
         cuda.hats([0.5] * 17, torch.zeros(3))
