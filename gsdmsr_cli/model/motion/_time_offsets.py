@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -40,7 +41,7 @@ class TimeOffsets:
         """
         self.values = torch.zeros(frames)
         self._frame = 1 / (frames - 1)
-        self._known: list[float] = self.values.tolist()
+        self._frames, self._known = np.arange(frames), np.zeros(frames)
         self._known_at = -1.0
 
     def parameters(self, name: str) -> Sequence[Parameter]:
@@ -54,7 +55,7 @@ class TimeOffsets:
             self._known_at = progress
 
     def _read(self) -> None:
-        self._known = self.values.tolist()
+        self._known = np.array(self.values.tolist())
 
     def of(self, times: Sequence[float]) -> list[float]:
         """Return the offsets of frames of these times [frames]."""
@@ -93,10 +94,7 @@ class TimeOffsets:
         """Return the clock of the offsets, and by how many frames it is later than that."""
 
         def taken(time: float) -> float:
-            place = min(max(time, 0.0), 1.0) * (len(self._known) - 1)
-            before = min(int(place), len(self._known) - 2)
-            share, near = place - before, self._known[before : before + 2]
-            offset = (1 - share) * near[0] + share * near[1]
+            offset = float(np.interp(time / self._frame, self._frames, self._known))
             return time + (offset + later) * self._frame
 
         return taken

@@ -29,14 +29,14 @@ def light(sh: Tensor, slopes: Tensor, quats: Tensor, canonical_quats: Tensor) ->
         slopes: (N, 3, 3), axis of the turn and channel.
         quats, canonical_quats: (N, 4) rotations now and before, wxyz, not necessarily normalised.
     """
-    now, before = quats.detach(), canonical_quats.detach()
-    form = choose(sh, slopes, now, before)
+    given = sh, slopes, quats, canonical_quats
+    form = choose(*given)
     if form == "cpu":
-        lit: Tensor = _Light.apply(sh, slopes, now, before)
+        lit: Tensor = _Light.apply(*given)
         return lit
     if form == "cuda":
-        return add_series(sh.flatten(1), slopes, turns_twin(now, before)).view_as(sh)
-    return light_twin(sh, slopes, now, before)
+        return add_series(sh.flatten(1), slopes, turns_twin(quats, canonical_quats)).view_as(sh)
+    return light_twin(*given)
 
 
 class _Light(Function):

@@ -9,6 +9,7 @@ from gsdmsr_cli.ground.geometry import quat_product
 from gsdmsr_cli.ops.series.twin import add_series_twin
 
 
+@torch.no_grad()
 def turns_twin(quats: Tensor, canonical_quats: Tensor) -> Tensor:
     """Return twice the vector parts (N, 3) of the unit quaternions between rotations (N, 4)."""
     back = torch.cat([canonical_quats[:, :1], -canonical_quats[:, 1:]], dim=1)
@@ -18,5 +19,5 @@ def turns_twin(quats: Tensor, canonical_quats: Tensor) -> Tensor:
 
 def light_twin(sh: Tensor, slopes: Tensor, quats: Tensor, canonical_quats: Tensor) -> Tensor:
     """Return what ``light`` does, for any device and dtype."""
-    turns = turns_twin(quats.detach(), canonical_quats.detach())
+    turns = turns_twin(quats, canonical_quats)
     return add_series_twin(sh.flatten(1), slopes, turns).view_as(sh)

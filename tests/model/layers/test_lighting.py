@@ -4,26 +4,24 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import Any
 
 import pytest
 import torch
 from kernel_checks import generator
-from motion_checks import FACTS, disturbed, splats_of, started
+from layer_checks import started_layer
+from motion_checks import disturbed, splats_of, started
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from gsdmsr_cli.gaussians.moment import Moment
-from gsdmsr_cli.model import layers
-from gsdmsr_cli.model.layer import Instant, Layer, start_layer
+from gsdmsr_cli.model.layer import Instant, Layer
 from gsdmsr_cli.model.model import Model
 
 COUNT = 6
 
 
-def lighting(count: int = COUNT, **options: Any) -> Layer:
-    given = {"name": "lighting", **options}
-    layer = start_layer(layers.__name__, given, FACTS, splats_of(count), generator())
+def lighting(count: int = COUNT) -> Layer:
+    layer = started_layer("lighting", count)
     with torch.no_grad():
         layer.tensors()["slopes"].copy_(torch.randn(count, 3, 3, generator=generator(4)))
     return layer
@@ -82,8 +80,7 @@ def test_in_a_model_the_motion_turns_and_what_stands_still_keeps_its_colours() -
 
 
 def test_a_new_layer_changes_nothing() -> None:
-    splats = splats_of(COUNT)
-    layer = start_layer(layers.__name__, {"name": "lighting"}, FACTS, splats, generator())
+    layer = started_layer("lighting", COUNT)
     moment = turned(Rotation.random(COUNT, random_state=0))
     assert not added(layer, moment).any() and layer.identity_at_start
 
