@@ -262,10 +262,12 @@ class DensityOptions:
     Attributes:
         every: least interval of growing and pruning [steps].
         rounds: most times that splats grow, spread evenly over progress: a longer training has
-            more steps in between, not more splats.
+            more steps in between, not more rounds.
         start: first step at which it happens [steps].
         until: progress at which it ends.
         gradient: mean norm of the screen-space gradient above which a splat grows [1 / NDC unit].
+        long_from: steps of a training beyond which it is lower, see
+            ``training.population.density.gradient_at``; 0 is never.
         split_scale: a growing splat is split above this scale and cloned below [scene radii].
         prune_scale: a splat above this scale is pruned as long as splats grow [scene radii].
         prune_opacity: a splat below this opacity is pruned.
@@ -282,6 +284,7 @@ class DensityOptions:
     start: int = 300
     until: float = 0.35
     gradient: float = 9e-4
+    long_from: int = 0
     split_scale: float = 0.01
     prune_scale: float = 1.0
     prune_opacity: float = 0.005
@@ -293,7 +296,7 @@ class DensityOptions:
 
     def __post_init__(self) -> None:
         require_at_least(self, 1, "every", "rounds", "cap")
-        require_at_least(self, 0, "start")
+        require_at_least(self, 0, "start", "long_from")
         require_progress(self, "until")
         require_positive(self, "gradient", "split_scale", "prune_scale")
         require(self, "prune_opacity", 0.0 <= self.prune_opacity < 1.0, "0 or more, below 1")

@@ -266,6 +266,19 @@ def test_a_longer_training_grows_no_more_often(
     assert all(step % every == 0 for step in grown) and grown[-1] > steps / 3
 
 
+def test_in_a_long_training_more_splats_grow(tiny_scene: Path) -> None:
+    steps = "training.steps=60", "density.every=10", "density.start=0", "density.reset_at=[]"
+    grown = []
+    for long_from in (0, 6, 1):
+        preset = preset_of(
+            *steps, f"density.long_from={long_from}", "density.cap=9000", "density.gradient=1e-2"
+        )
+        trainer = trainer_of(tiny_scene, preset)
+        after(trainer, 60)
+        grown.append(len(trainer.model.splats))
+    assert grown[0] < grown[1] < grown[2]
+
+
 def test_the_motion_is_told_where_the_first_splats_are(tiny_scene: Path) -> None:
     trainer = trainer_of(tiny_scene, preset_of("splats.count=2000", "density.cap=2000"))
     lower, upper = torch.tensor(trainer.facts.box)

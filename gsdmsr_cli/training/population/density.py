@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -59,8 +59,9 @@ class Density(Event):
         growing = self._growing(tick)
         self.rounds += growing
         model, given = population.model, (population.radius, growing, population.generator)
+        options = replace(self.options, gradient=gradient_at(self.options, tick))
         change = grow_and_prune(
-            model.splats, population.statistics, self.options, *given, model.to_split(),
+            model.splats, population.statistics, options, *given, model.to_split(),
             model.highest_opacities(),
         )  # fmt: skip
         if not len(change.rows):
@@ -84,6 +85,19 @@ class Density(Event):
 def start(options: Options, preset: Preset) -> Density:
     """Return density control as the preset wants it."""
     return Density(preset.density)
+
+
+def gradient_at(options: DensityOptions, tick: Tick) -> float:
+    """Return the gradient above which a splat grows at a time of a training.
+
+    It falls with the cube root of the steps that the training is going to have, judged by those
+    that it has made, once these are more than ``long_from``: what more splats cost, a long training
+    has the time for.
+    """
+    expected = tick.step / tick.progress if tick.progress else 0.0
+    if not options.long_from or expected <= options.long_from:
+        return options.gradient
+    return options.gradient * (options.long_from / expected) ** (1 / 3)
 
 
 @torch.no_grad()

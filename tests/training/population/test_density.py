@@ -12,7 +12,8 @@ from kernel_checks import generator
 from gsdmsr_cli.gaussians.splats import Splats
 from gsdmsr_cli.ground.geometry import covariance
 from gsdmsr_cli.options.preset import DensityOptions
-from gsdmsr_cli.training.population.density import grow_and_prune
+from gsdmsr_cli.training.population import Tick
+from gsdmsr_cli.training.population.density import gradient_at, grow_and_prune
 from gsdmsr_cli.training.resizing import SPLIT_SHRINK
 from gsdmsr_cli.training.statistics import DensityStatistics
 
@@ -173,3 +174,21 @@ def test_the_parents_stay_as_they_are() -> None:
     grown(splats, [1.0, 1.0])
     for name, tensor in splats.tensors().items():
         assert torch.equal(tensor, before.tensors()[name]), name
+
+
+@pytest.mark.parametrize(
+    ("step", "progress", "share"),
+    [
+        (2000, 0.2, 1.0),  # of 10,000 steps
+        (2000, 0.1, 1.0),  # of 20,000, as many as it is for
+        (2000, 0.0125, 0.5),  # of 160,000
+        (16000, 0.1, 0.5),
+        (1, 0.0, 1.0),  # nothing is known yet
+    ],
+)
+def test_the_threshold_falls_with_the_cube_root_of_the_length(
+    step: int, progress: float, share: float
+) -> None:
+    tick, options = Tick(step, progress), replace(OPTIONS, long_from=20000)
+    assert gradient_at(options, tick) == pytest.approx(share * OPTIONS.gradient)
+    assert gradient_at(OPTIONS, tick) == OPTIONS.gradient
