@@ -67,7 +67,7 @@ class Options:
     time_ends: float = 1.0
     time_degree: int = 1
     time_offsets_from: float = 1.0
-    time_offsets_weight: float = 1e-3
+    time_offsets_weight: float = 1e-4
     width: int = 32
     space_smoothness: float = 1e-4
     time_smoothness: float = 1e-2

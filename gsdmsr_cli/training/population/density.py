@@ -97,7 +97,7 @@ def gradient_at(options: DensityOptions, tick: Tick) -> float:
     expected = tick.step / tick.progress if tick.progress else 0.0
     if not options.long_from or expected <= options.long_from:
         return options.gradient
-    return options.gradient * (options.long_from / expected) ** (1 / 3)
+    return options.gradient * math.pow(options.long_from / expected, 1 / 3)
 
 
 @torch.no_grad()
