@@ -90,14 +90,14 @@ def start(options: Options, preset: Preset) -> Density:
 def gradient_at(options: DensityOptions, tick: Tick) -> float:
     """Return the gradient above which a splat grows at a time of a training.
 
-    It falls with the cube root of the steps that the training is going to have, judged by those
+    It falls with the square root of the steps that the training is going to have, judged by those
     that it has made, once these are more than ``long_from``: what more splats cost, a long training
     has the time for.
     """
     expected = tick.step / tick.progress if tick.progress else 0.0
     if not options.long_from or expected <= options.long_from:
         return options.gradient
-    return options.gradient * math.pow(options.long_from / expected, 1 / 3)
+    return options.gradient * math.sqrt(options.long_from / expected)
 
 
 @torch.no_grad()

@@ -181,12 +181,12 @@ def test_the_parents_stay_as_they_are() -> None:
     [
         (2000, 0.2, 1.0),  # of 10,000 steps
         (2000, 0.1, 1.0),  # of 20,000, as many as it is for
-        (2000, 0.0125, 0.5),  # of 160,000
-        (16000, 0.1, 0.5),
+        (2000, 0.025, 0.5),  # of 80,000
+        (8000, 0.1, 0.5),
         (1, 0.0, 1.0),  # nothing is known yet
     ],
 )
-def test_the_threshold_falls_with_the_cube_root_of_the_length(
+def test_the_threshold_falls_with_the_square_root_of_the_length(
     step: int, progress: float, share: float
 ) -> None:
     tick, options = Tick(step, progress), replace(OPTIONS, long_from=20000)
