@@ -94,10 +94,10 @@ def gradient_at(options: DensityOptions, tick: Tick) -> float:
     that it has made, once these are more than ``long_from``: what more splats cost, a long training
     has the time for.
     """
-    expected = tick.step / tick.progress if tick.progress else 0.0
-    if not options.long_from or expected <= options.long_from:
+    if not options.long_from or not tick.progress:
         return options.gradient
-    return options.gradient * math.sqrt(options.long_from / expected)
+    share = options.long_from * tick.progress / tick.step
+    return options.gradient * math.sqrt(min(share, 1.0))
 
 
 @torch.no_grad()
