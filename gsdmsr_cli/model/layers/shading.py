@@ -67,21 +67,14 @@ class Shading(Layer):
         sh = moment.splats.sh
         shares = hats([instant.time], sh.new_empty(self.gains.shape[1]))[0]
         gains = (self.gains @ shares)[:, None, None]
-        # colours are 1/2 + C0 sh[:, 0] + ...
-        brighter = sh * (1 + gains) + _half_where_constant(sh) * gains
+        brighter = sh * (1 + gains)
+        brighter[:, 0] += gains[:, 0] / (2 * SH_C0)  # colours are 1/2 + C0 sh[:, 0] + ...
         return replace(moment, splats=replace(moment.splats, sh=brighter))
 
     def check(self) -> None:
         """Raise ValueError unless there are numbers for two times or more."""
         if self.gains.shape[1] < 2:
             raise ValueError(f"gains of shape {tuple(self.gains.shape)}")
-
-
-def _half_where_constant(sh: torch.Tensor) -> torch.Tensor:
-    """Return 1 / 2 as harmonics (K, 1) of K functions."""
-    half = sh.new_zeros(sh.shape[1], 1)
-    half[0] = 0.5 / SH_C0
-    return half
 
 
 def start(options: Options, facts: Facts, splats: Splats, generator: torch.Generator) -> Shading:

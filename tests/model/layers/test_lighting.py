@@ -8,14 +8,13 @@ from dataclasses import replace
 import pytest
 import torch
 from kernel_checks import generator
-from layer_checks import started_layer
-from motion_checks import disturbed, splats_of, started
+from layer_checks import started_layer, with_and_without
+from motion_checks import splats_of
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from gsdmsr_cli.gaussians.moment import Moment
 from gsdmsr_cli.model.layer import Instant, Layer
-from gsdmsr_cli.model.model import Model
 
 COUNT = 6
 
@@ -68,12 +67,8 @@ def test_slopes_learn_and_turns_do_not() -> None:
 
 
 def test_in_a_model_the_motion_turns_and_what_stands_still_keeps_its_colours() -> None:
-    splats, moving = splats_of(COUNT), 4
-    motion = disturbed(started("control_points", moving, count=4, neighbours=2))
-    model = Model(splats, {"motion": motion, "layers.0": lighting(moving)}, moving)
-    plain = Model(splats, {"motion": motion}, moving)
-    with torch.no_grad():
-        lit, unlit = (m.at(m.instant(0.3)).splats for m in (model, plain))
+    moving = 4
+    lit, unlit = with_and_without(lighting(moving), COUNT, moving)
     apart = (lit.sh - unlit.sh)[:, 0].abs().amax(dim=1)
     assert (apart[:moving] > 1e-4).all() and not apart[moving:].any()
     assert torch.equal(lit.means, unlit.means)

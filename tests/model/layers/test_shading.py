@@ -8,15 +8,14 @@ import numpy as np
 import pytest
 import torch
 from kernel_checks import generator
-from layer_checks import started_layer
-from motion_checks import disturbed, splats_of, started
+from layer_checks import started_layer, with_and_without
+from motion_checks import splats_of
 from torch import Tensor
 
 from gsdmsr_cli.gaussians.moment import Moment
 from gsdmsr_cli.ground.errors import UsageError
 from gsdmsr_cli.ground.geometry import SH_C0
 from gsdmsr_cli.model.layer import Instant, Layer
-from gsdmsr_cli.model.model import Model
 
 COUNT, NODES = 6, 5
 
@@ -78,12 +77,8 @@ def test_before_it_is_learnt_nothing_changes() -> None:
 
 
 def test_in_a_model_what_stands_still_keeps_its_colours() -> None:
-    splats, moving = splats_of(COUNT), 4
-    motion = disturbed(started("control_points", moving, count=4, neighbours=2))
-    model = Model(splats, {"motion": motion, "layers.0": shading(moving)}, moving)
-    plain = Model(splats, {"motion": motion}, moving)
-    with torch.no_grad():
-        shaded, as_it_was = (m.at(m.instant(0.3)).splats for m in (model, plain))
+    moving = 4
+    shaded, as_it_was = with_and_without(shading(moving), COUNT, moving)
     apart = (shaded.sh - as_it_was.sh)[:, 0].abs().amax(dim=1)
     assert (apart[:moving] > 1e-4).all() and not apart[moving:].any()
 
