@@ -21,7 +21,7 @@ def apply(layer: Layer, moments: Sequence[Moment], instants: Sequence[Instant]) 
     """Return the moments after a layer, at once where it is given the same one for all instants."""
     if len(set(moments)) == 1 and len(instants) > 1:
         return layer.at_instants(moments[0], instants)
-    return [layer.at(moment, now) for moment, now in zip(moments, instants, strict=True)]
+    return layer.at_moments(moments, instants)
 
 
 def split(moment: Moment, count: int) -> tuple[Moment, Moment]:

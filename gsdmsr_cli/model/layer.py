@@ -90,10 +90,10 @@ class Layer(ABC):
         shades: whether ``shade`` does anything.
         holds_views: whether it holds something of each picture of the capture, and does nothing
             where none of these is drawn.
-        constants: names of the attributes that ``at_instants`` reads beside parameters and times,
-            and that may change as it trains. While they stay the same a GPU may replay its
-            launches, for which all times are to be read as ``recording.vary`` has it; None if they
-            are not.
+        constants: names of the attributes that ``at_instants`` and ``at_moments`` read beside
+            parameters and times, and that may change as it trains. While they stay the same a GPU
+            may replay its launches, for which all times are to be read as ``recording.vary`` has
+            it, of all instants at once; None if they are not.
     """
 
     identity_at_start: bool = True
@@ -115,7 +115,11 @@ class Layer(ABC):
 
     def at_instants(self, moment: Moment, instants: Sequence[Instant]) -> list[Moment]:
         """Return what ``at`` does at each of the instants, with less work where possible."""
-        return [self.at(moment, instant) for instant in instants]
+        return self.at_moments([moment] * len(instants), instants)
+
+    def at_moments(self, moments: Sequence[Moment], instants: Sequence[Instant]) -> list[Moment]:
+        """Return what ``at`` does with each moment at its instant, with less work if possible."""
+        return [self.at(moment, now) for moment, now in zip(moments, instants, strict=True)]
 
     def shade(self, frame: Frame, instant: Instant) -> Frame:
         """Return the frame with colours made anew from what was drawn, such as features."""

@@ -133,7 +133,7 @@ def nobody(monkeypatch: pytest.MonkeyPatch) -> Nobody:
     return nobody
 
 
-LIGHTING = "layers=[{name: lighting}]"
+COLOURS = "layers=[{name: lighting}, {name: shading, since: 0}]"
 
 
 def elsewhere(data: Path, preset: Preset) -> Trainer:
@@ -183,7 +183,7 @@ def test_hexplane_stays_on_its_device(tiny_scene: Path, nobody: Nobody, option: 
     assert {"lookup", "lookup_backward", "time_penalty"} <= set(nobody.asked)
 
 
-@pytest.mark.parametrize("further", [(), ("motion.time_offsets_from=0", LIGHTING)])
+@pytest.mark.parametrize("further", [(), ("motion.time_offsets_from=0", COLOURS)])
 def test_control_points_stay_on_their_device(
     tiny_scene: Path, nobody: Nobody, monkeypatch: pytest.MonkeyPatch, further: tuple[str, ...]
 ) -> None:

@@ -10,9 +10,11 @@ brightness where they ought to move.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
+from torch import Tensor
 
 from gsdmsr_cli.gaussians.moment import Moment
 from gsdmsr_cli.gaussians.splats import Splats
@@ -50,6 +52,8 @@ class Shading(Layer):
         learning: whether it is learnt yet; before it changes nothing.
     """
 
+    constants = ("learning",)
+
     def __init__(self, options: Options, count: int) -> None:
         self.options = options
         self.learning = True
@@ -62,19 +66,30 @@ class Shading(Layer):
 
     def at(self, moment: Moment, instant: Instant) -> Moment:
         """Return the splats as bright as they are at the instant."""
+        return self.at_moments([moment], [instant])[0]
+
+    def at_moments(self, moments: Sequence[Moment], instants: Sequence[Instant]) -> list[Moment]:
+        """Return the splats of each moment as bright as they are at its instant."""
         if not self.learning:
-            return moment
-        sh = moment.splats.sh
-        shares = hats([instant.time], sh.new_empty(self.gains.shape[1]))[0]
-        gains = (self.gains @ shares)[:, None, None]
-        brighter = sh * (1 + gains)
-        brighter[:, 0] += gains[:, 0] / (2 * SH_C0)  # colours are 1/2 + C0 sh[:, 0] + ...
-        return replace(moment, splats=replace(moment.splats, sh=brighter))
+            return list(moments)
+        shares = hats([instant.time for instant in instants], self.gains[0])
+        return [
+            _brighter(moment, gains)
+            for moment, gains in zip(moments, (self.gains @ shares.T).unbind(1), strict=True)
+        ]
 
     def check(self) -> None:
         """Raise ValueError unless there are numbers for two times or more."""
         if self.gains.shape[1] < 2:
             raise ValueError(f"gains of shape {tuple(self.gains.shape)}")
+
+
+def _brighter(moment: Moment, gains: Tensor) -> Moment:
+    """Return the splats, of colour c, in the colour c + gains c, with gains (N,)."""
+    sh, by = moment.splats.sh, gains[:, None, None]
+    brighter = sh * (1 + by)
+    brighter[:, 0] += by[:, 0] / (2 * SH_C0)  # colours are 1/2 + C0 sh[:, 0] + ...
+    return replace(moment, splats=replace(moment.splats, sh=brighter))
 
 
 def start(options: Options, facts: Facts, splats: Splats, generator: torch.Generator) -> Shading:

@@ -68,6 +68,25 @@ def test_gains_and_colours_learn() -> None:
     torch.testing.assert_close(sh.grad, weights * factors, atol=1e-6, rtol=1e-5)
 
 
+def test_moments_at_once_are_as_one_by_one() -> None:
+    layer, given = shading(), [Moment(splats_of(COUNT, seed=seed)) for seed in (1, 2)]
+    instants = [Instant(0.15), Instant(0.8)]
+    weights = torch.randn(given[0].splats.sh.shape, generator=generator(5))
+    found = []
+    for after in (
+        layer.at_moments(given, instants),
+        [layer.at(moment, now) for moment, now in zip(given, instants, strict=True)],
+    ):
+        (gradient,) = torch.autograd.grad(
+            sum(((moment.splats.sh * weights).sum() for moment in after), torch.zeros(())),
+            layer.tensors()["gains"],
+        )
+        found.append([*(moment.splats.sh.detach() for moment in after), gradient])
+    torch.testing.assert_close(*found)
+    apart = layer.at_instants(given[0], instants)
+    assert not torch.equal(apart[0].splats.sh, apart[1].splats.sh)
+
+
 def test_before_it_is_learnt_nothing_changes() -> None:
     layer, moment = shading(since=0.4), Moment(splats_of(COUNT))
     layer.advance(0.39)

@@ -29,6 +29,7 @@ MOTIONS = [
     ("control_points", ("motion.count=20",)),
     ("control_points", ("motion.count=20", "motion.time_offsets_from=0")),
     ("control_points", ("motion.count=20", "layers=[{name: lighting}]")),
+    ("control_points", ("motion.count=20", "layers=[{name: shading, since: 0}]")),
     ("hexplane", ()),
     ("multiscale", ()),
     ("static", ()),
