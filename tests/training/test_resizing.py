@@ -20,7 +20,9 @@ ROWS = torch.tensor([119, 3, 3, 0, 77])
 @pytest.fixture
 def trainer(tiny_scene: Path) -> Trainer:
     """A training that moves, of 120 splats; what is kept for each is marked by its row."""
-    trainer = trainer_of(tiny_scene, preset_of("density.start=999", "splats.sh_degree=1"))
+    learning = "layers=[{name: lighting}, {name: shading, since: 0}]"
+    options = "density.start=999", "splats.sh_degree=1", learning
+    trainer = trainer_of(tiny_scene, preset_of(*options))
     for _ in range(8):
         trainer.step()
     population = trainer.population

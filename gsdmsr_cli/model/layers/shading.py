@@ -72,7 +72,8 @@ class Shading(Layer):
         """Return the splats of each moment as bright as they are at its instant."""
         if not self.learning:
             return list(moments)
-        shares = hats([instant.time for instant in instants], self.gains[0])
+        times, nodes = [instant.time for instant in instants], self.gains.shape[1]
+        shares = hats(times, self.gains.new_empty(nodes))
         return [
             _brighter(moment, gains)
             for moment, gains in zip(moments, (self.gains @ shares.T).unbind(1), strict=True)
