@@ -18,7 +18,7 @@ from gsdmsr_cli.model.layer import Instant, Layer
 
 
 def apply(layer: Layer, moments: Sequence[Moment], instants: Sequence[Instant]) -> list[Moment]:
-    """Return the moments after a layer, at once where it is given the same one for all instants."""
+    """Return the moments after a layer, by ``at_instants`` where all are the same one."""
     if len(set(moments)) == 1 and len(instants) > 1:
         return layer.at_instants(moments[0], instants)
     return layer.at_moments(moments, instants)
